@@ -30,9 +30,9 @@ from typing import (
 
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short, suggest
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
-from skillweave.messages import short, suggest
 from skillweave.policies.files import shown
 
 C = TypeVar("C", bound=type[Any])

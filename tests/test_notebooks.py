@@ -16,7 +16,7 @@ import pytest
 from small_runs import stage_entry
 
 from skillweave import PPO, Agent, Hierarchy, Network, Run, Skill, notebooks as module, tree
-from skillweave.notebooks import facts, in_notebook, joined, table
+from skillweave._internal.notebooks import facts, in_notebook, joined, table
 from skillweave.reporting.progress import EpisodeProgress, Progress
 from skillweave.reporting.video import Film
 from skillweave.types import Evaluation

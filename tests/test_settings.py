@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import skillweave as sw
+from skillweave._internal.public import HOMES
 from skillweave.algorithms import OnPolicy
 from skillweave.algorithms.config import (
     ActorCritic,
@@ -27,7 +28,6 @@ from skillweave.algorithms.config import (
 )
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution import Evolution, Mutations, Range, Tournament, Truncation
-from skillweave.public import HOMES
 from skillweave.schema import described, fitted
 
 if TYPE_CHECKING:

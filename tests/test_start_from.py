@@ -28,8 +28,8 @@ from skillweave import (
     TrainDefaults,
 )
 from skillweave.cli import main
-from skillweave.collecting.acting import Acting
 from skillweave.errors import RunError
+from skillweave.experience.acting import Acting
 from skillweave.hierarchy import training
 from skillweave.reporting.report.facts import settings
 from skillweave.runs import initial_policies

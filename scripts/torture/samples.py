@@ -42,6 +42,7 @@ from skillweave import (
     Skill,
     from_onnx,
 )
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api import Agent, Run, train_agent
 from skillweave.cli import commands, execute
@@ -51,7 +52,6 @@ from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory
 from skillweave.schema import as_json
-from skillweave.seeding import Seeds
 from skillweave.spaces import pack
 from skillweave.types import Policy
 

@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 
 from skillweave import recipes
+from skillweave._internal.messages import error_text, short
+from skillweave._internal.terminal import say
 from skillweave.api import Hierarchy
 from skillweave.api.loading import finish
 from skillweave.api.running import begun
@@ -27,17 +29,15 @@ from skillweave.cli import commands
 from skillweave.cli.overrides import apply_overrides
 from skillweave.cli.processes import ProcessEnded, processes
 from skillweave.cli.sweep_code import MARK, must_be_same_code
-from skillweave.collecting.cluster import Ray
-from skillweave.collecting.shipping import packed, unpacked
 from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy import training
-from skillweave.messages import error_text, short
 from skillweave.reporting.report.groups import over_seeds
 from skillweave.runs.manifest import Manifest
 from skillweave.schema import AtLeastOne, fitted
-from skillweave.terminal import say
 from skillweave.training.evaluation_file import load_evaluation
+from skillweave.workers.cluster import Ray
+from skillweave.workers.shipping import packed, unpacked
 
 MOST = 10_000
 """Runs of a sweep."""
@@ -216,7 +216,7 @@ def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float 
     """Do each run as a task of Ray; one whose machine is lost continues on another."""
     cluster = Ray(address=command.ray or None)
     with cluster.joined(command.jobs or cores()) as ray:
-        from skillweave.collecting.actors import LOST, check_versions
+        from skillweave.workers.actors import LOST, check_versions
 
         kind = ray.remote(num_cpus=1, max_retries=RETRIES, max_calls=1)(_task())
         good = [(metadata.version("skillweave"), platform.python_version())]
@@ -250,7 +250,7 @@ def _task() -> Callable[..., Any]:
     It returns the node's versions where they do not fit, else None; and the run's result. It is
     sent to the nodes as code, so that it can report a node without Skillweave.
     """
-    from skillweave.collecting.actor_host import actor_class
+    from skillweave.workers.actor_host import actor_class
 
     place = actor_class()()
 

@@ -18,11 +18,11 @@ from types import ModuleType
 from typing import TypedDict
 
 from skillweave import recipes
-from skillweave.collecting.shipping import is_own_code
 from skillweave.errors import RunError
 from skillweave.policies.files import shown
 from skillweave.runs.files import read_json, write_json
 from skillweave.schema import fit
+from skillweave.workers.shipping import is_own_code
 
 MARK = ".sweep"
 """A file in the sweep's directory; a machine that can read it shares the directory."""

@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy, state_from
 from skillweave.errors import RunError
 from skillweave.policies.files import check_file
 from skillweave.runs.files import read_tensors, record_in, write_tensors
-from skillweave.seeding import Seeds
 
 
 def save_agent(path: str | Path, algorithm: Algorithm, state: Any, about: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ from typing import Any, Self, cast
 import numpy as np
 import torch
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.compat.agent_files import load_agent, save_agent
 from skillweave.compat.batches import rollout_of, sample_of
@@ -17,7 +18,6 @@ from skillweave.evolution.config import Mutations
 from skillweave.evolution.mutation import mutate, with_settings
 from skillweave.evolution.stacks import Member, copy
 from skillweave.runs.manifest import Origin
-from skillweave.seeding import Seeds
 from skillweave.types import Array
 
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from skillweave.public import lazy
+from skillweave._internal.public import lazy
 
 if TYPE_CHECKING:
     from skillweave.envs.pool import PoolWrapper as PoolWrapper, one_of as one_of

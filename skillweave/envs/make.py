@@ -14,7 +14,9 @@ import gymnasium as gym
 import numpy as np
 
 import skillweave.toys  # registers their ids  # noqa: F401
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import error_text, short, shortened, suggest
+from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.envs.checks import CheckedEnv, is_batched, refuse_batched
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
@@ -22,10 +24,8 @@ from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.obs_names import Names, ObsNames, names_in
 from skillweave.envs.pool import MakePool, envpool, takes_ids
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError
-from skillweave.messages import error_text, short, shortened, suggest
 from skillweave.policies.infos import batched_infos
 from skillweave.schema import AtLeastOne, Check, check_fields, to_json
-from skillweave.seeding import Seeds, global_generators
 from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
 from skillweave.spaces.packing import parts
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from skillweave.public import lazy
+from skillweave._internal.public import lazy
 
 if TYPE_CHECKING:
     from skillweave.evolution.config import (

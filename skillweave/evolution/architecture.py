@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.named import Named
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.policy import make_algorithm
@@ -22,7 +23,6 @@ from skillweave.errors import DeclarationError
 from skillweave.evolution import growth
 from skillweave.evolution.config import Mutations
 from skillweave.evolution.stacks import Member, copy, even_count, networks_of, spread_count
-from skillweave.named import Named
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.encoders import ImageEncoder
 from skillweave.networks.stacked import Views

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError
-from skillweave.messages import short
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission_text import parse

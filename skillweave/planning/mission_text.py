@@ -9,8 +9,8 @@ import re
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, NoReturn
 
+from skillweave._internal.messages import suggest
 from skillweave.errors import DeclarationError
-from skillweave.messages import suggest
 from skillweave.planning.parts import (
     MOST_TOGETHER,
     AnyOrder,

@@ -8,8 +8,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave._internal.messages import short
 from skillweave.errors import EnvError
-from skillweave.messages import short
 from skillweave.policies.spaces import MOST_CHOICES, MOST_OF_ALL
 from skillweave.spaces.packing import parts
 

@@ -12,25 +12,25 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.arguments import checked_names
-from skillweave.collecting.skill_set import skills_below
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
+from skillweave._internal.notebooks import joined, paragraph, table
+from skillweave._internal.notices import notice
+from skillweave._internal.seeding import Seeds, global_generators
+from skillweave._internal.terminal import printable
 from skillweave.envs.checks import longest_evaluation, time_limit
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import reported_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.envs.pool import POOL_SEEDS
 from skillweave.errors import DeclarationError, SkillweaveError
-from skillweave.messages import short
-from skillweave.notebooks import joined, paragraph, table
-from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.schema import AtLeastOne, Count, fitted
-from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill
 from skillweave.skills.foreign_policy import Foreign, check_spaces
 from skillweave.skills.goals import goals_of
-from skillweave.terminal import printable
+from skillweave.skills.skill_set import skills_below
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.training.skill_report import (

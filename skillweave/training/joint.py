@@ -11,25 +11,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.paths import CRITIC, SELECTOR, decides, level_of, relative
+from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.algorithms.base import Algorithm, state_to
+from skillweave.algorithms.batches import Reference
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentPolicy, checked_tensor, make_algorithm, state_from
-from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.collector import Collector
-from skillweave.collecting.group import MakeCollector
-from skillweave.collecting.placement import MakeCollectors, make_collectors
 from skillweave.envs.checks import longest_evaluation
 from skillweave.envs.engine import Engine
 from skillweave.envs.make import make_engine
 from skillweave.errors import RunError
-from skillweave.experience import Reference
+from skillweave.experience.acting import Acting, Request
+from skillweave.experience.collector import Collector
+from skillweave.experience.group import MakeCollector
 from skillweave.ops.device import INT, resolve_device
 from skillweave.ops.threads import torch_threads
-from skillweave.paths import CRITIC, SELECTOR, decides, level_of, relative
 from skillweave.runs.initial_policies import initial_policy
 from skillweave.runs.manifest import StageEntry
 from skillweave.runs.states import load_state, state_path
-from skillweave.seeding import Seeds, global_generators
 from skillweave.training.joint_learner import JointLearner
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
 from skillweave.training.learning_task import JointTask
@@ -39,6 +38,7 @@ from skillweave.training.stage_log import StageLog, success_rate
 from skillweave.training.stage_run import StageRun, begin_as
 from skillweave.training.trainer import OneAgent
 from skillweave.types import Array, prefixed, unprefixed
+from skillweave.workers.placement import MakeCollectors, make_collectors
 
 
 def agents_of(stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> OneAgent:

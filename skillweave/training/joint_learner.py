@@ -8,12 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from skillweave._internal.paths import CRITIC, SELECTOR, decides, join, name_of, relative
+from skillweave.algorithms.batches import Batch
 from skillweave.buffers.rollout import RolloutStore
-from skillweave.collecting.acting import Request
-from skillweave.experience import Batch
+from skillweave.experience.acting import Request
 from skillweave.ops.device import FLOAT
 from skillweave.ops.moments import normalize
-from skillweave.paths import CRITIC, SELECTOR, decides, join, name_of, relative
 from skillweave.training.learner import Learner, RolloutLearner, Stack
 from skillweave.types import Array, prefixed, unprefixed
 

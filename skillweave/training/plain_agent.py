@@ -7,16 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.paths import AGENT
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmSettings, check_spaces
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.arguments import checked_names
-from skillweave.collecting.user_code import environment_texts
 from skillweave.envs.make import EnvSpec, Spaces
-from skillweave.paths import AGENT
 from skillweave.runs.command_words import Caller
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Manifest
+from skillweave.runs.user_code import environment_texts
 from skillweave.schema import AtLeastOne, Share, check_fields
 from skillweave.spaces import action_codec
 from skillweave.training.checks import EnvValue, check_env, check_rollout

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from skillweave import DQN, SAC, TD3, Network
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.acting import Acting, ActionRepeat, Request
-from skillweave.seeding import Seeds
+from skillweave.experience.acting import Acting, ActionRepeat, Request
 from skillweave.training.learner import Stack
 from skillweave.training.replay_learner import learner_of
 

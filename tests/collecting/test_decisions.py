@@ -11,12 +11,12 @@ from reference_calls import Counter, Die, Left, Right, T, Walk, Zigzag, scripted
 from toy_acting import Again, Choices, Given, requests
 from toys import alone_in, calling_in, network_of, skills_of
 
-from skillweave.collecting.skill_set import SkillSet
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
-from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 
 SPACES = Walk.observation_space, Walk.action_space
 N, ALL = 4, (Left, Right, Zigzag, Counter)
@@ -177,7 +177,7 @@ def test_where_no_skill_may_start_the_error_names_them_all():
 
 
 def test_a_call_that_nothing_ends_is_told_and_not_waited_for(monkeypatch):
-    monkeypatch.setattr("skillweave.collecting.learners.LONGEST_EPISODE", 20)
+    monkeypatch.setattr("skillweave.experience.learners.LONGEST_EPISODE", 20)
 
     class Eternal(Left):
         max_steps = None

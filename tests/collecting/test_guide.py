@@ -8,13 +8,13 @@ from ready_selectors.chain import KEY, SPEC, GetKey, Leave, OpenDoor, Wait, boun
 from toy_acting import Choices, requests
 from toys import calling_in, skills_of
 
-from skillweave.collecting.acting import Acted
-from skillweave.collecting.calls import SMOOTHED, as_logits
-from skillweave.collecting.collector import joined_collected
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import make_engine
+from skillweave.experience.acting import Acted
+from skillweave.experience.calls import SMOOTHED, as_logits
+from skillweave.experience.collector import joined_collected
 from skillweave.policies.hierarchy import ActiveGuide
-from skillweave.seeding import Seeds
-from skillweave.selectors import Automaton
+from skillweave.skills import Automaton
 
 N = 3
 SKILLS = (GetKey(), OpenDoor(), Leave(), Wait())

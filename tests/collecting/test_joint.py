@@ -11,14 +11,14 @@ from reference_calls import EPISODE, POSITION, Walk
 from toy_acting import Choices, requests, valid_rows
 from toys import calling_in
 
-from skillweave.collecting.acting import Acting
-from skillweave.collecting.lengths import Lengths
-from skillweave.collecting.skill_set import SkillSet
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.experience.acting import Acting
 from skillweave.policies.core import CallEnd
-from skillweave.seeding import Seeds
 from skillweave.skills import Skill
+from skillweave.skills.lengths import Lengths
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Step
 
 N = 4

@@ -14,16 +14,16 @@ from test_levels import Down, Up, asked, collector_of
 from toy_acting import Choices, requests
 from toys import alone_in
 
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Batch
 from skillweave.algorithms.config import DQN, PPO
 from skillweave.algorithms.dqn import DQNAlgorithm
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.buffers.replay import ReplayStore
 from skillweave.buffers.rollout import RolloutStore
-from skillweave.collecting.judge import JudgedBy, judged_by
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import EnvError, TrainingError
-from skillweave.experience import Batch
-from skillweave.seeding import Seeds
+from skillweave.experience.judge import JudgedBy, judged_by
 from skillweave.skills import Skill
 from skillweave.training.learner import Stack
 from skillweave.training.replay_learner import learner_of

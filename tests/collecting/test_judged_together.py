@@ -12,12 +12,12 @@ from reference_calls import POSITION, Walk, scripted
 from toy_acting import Choices, requests
 from toys import alone_in, calling_in
 
-from skillweave.collecting.collector import Collector
-from skillweave.collecting.skill_set import SkillSet
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import EnvError, SkillError
-from skillweave.seeding import Seeds
+from skillweave.experience.collector import Collector
 from skillweave.skills import Skill
+from skillweave.skills.skill_set import SkillSet
 
 N, ROWS = 3, 12
 
@@ -142,7 +142,7 @@ def test_a_reward_is_called_once_in_a_request(make: Any, path: str) -> None:
 @pytest.mark.parametrize("pays", [numbers, sometimes])
 def test_large_observations_are_judged_in_parts(pays: Any, monkeypatch: Any) -> None:
     whole = rewards(alone(skill_of(pays)), ROWS, "")
-    monkeypatch.setattr("skillweave.collecting.views.AT_ONCE", 5 * alone(None).obs.nbytes)
+    monkeypatch.setattr("skillweave.experience.views.AT_ONCE", 5 * alone(None).obs.nbytes)
     sizes: list[int] = []
 
     def counted(step: Any) -> Any:

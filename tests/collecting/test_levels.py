@@ -14,11 +14,11 @@ from test_joint import Learner, Values
 from toy_acting import Again, Choices, Counts, requests, valid_rows
 from toys import alone_in, calling_in
 
-from skillweave.collecting.levels import UntrainedHierarchy
-from skillweave.collecting.skill_set import SkillSet
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.seeding import Seeds
+from skillweave.experience.levels import UntrainedHierarchy
 from skillweave.skills import Skill
+from skillweave.skills.skill_set import SkillSet
 
 N, ROWS, GAMMA, INNER = 4, 40, 0.97, 0.9
 

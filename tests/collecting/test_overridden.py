@@ -11,12 +11,12 @@ from test_joint import Choices, Down, Learner, N, Stay, Up, Values, asked
 from toy_acting import requests
 from toys import alone_in, calling_in
 
-from skillweave.collecting.skill_set import SkillSet
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.hierarchy.fitting import ready_policies
 from skillweave.hierarchy.roles import roles_of
-from skillweave.seeding import Seeds
 from skillweave.skills import Reflex
+from skillweave.skills.skill_set import SkillSet
 
 
 def far(obs):

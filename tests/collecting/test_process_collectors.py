@@ -19,13 +19,13 @@ from reference_calls import EPISODE
 from toy_acting import Again, Choices, Mortal, deciding, equal, requests, stepping
 from toys import alone_in
 
-from skillweave.collecting import processes, worker_process
-from skillweave.collecting.group import Collectors
-from skillweave.collecting.placement import make_collectors
-from skillweave.collecting.processes import ProcessCollectors
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
-from skillweave.seeding import Seeds
+from skillweave.experience.group import Collectors
+from skillweave.workers import processes, worker_process
+from skillweave.workers.placement import make_collectors
+from skillweave.workers.processes import ProcessCollectors
 
 
 def here(make):
@@ -152,7 +152,8 @@ def test_processes_that_are_not_forked_get_the_users_code_and_stay(
 
 PARENT = """
 import os, signal, time
-from skillweave.collecting import processes, worker_process
+from skillweave.workers import processes
+from skillweave.workers import worker_process
 from test_process_collectors import ProcessCollectors, stepping
 tasks = worker_process._tasks
 worker_process._tasks = lambda channel: (time.sleep(0.5), tasks(channel))[1]  # no parent by then

@@ -10,18 +10,18 @@ from reference_calls import POSITION, Counter, Left, Right, Walk, Zigzag
 from toy_acting import Choices, requests, valid_rows
 from toys import ASKS, SHOWS, alone_in, calling_in, skills_of
 
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Batch
 from skillweave.algorithms.config import PPO, SAC
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.collector import Collected, joined_collected, joined_from, parted
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.joined import JoinedEngines
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.experience import Batch
+from skillweave.experience.acting import Acting, Request
+from skillweave.experience.collector import Collected, joined_collected, joined_from, parted
 from skillweave.networks.config import CNN, RNN, Network
-from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 
 
 def env_of(shows, asks):

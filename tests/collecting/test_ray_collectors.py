@@ -23,18 +23,18 @@ from skillweave import (
     Agent,
     TrainDefaults,
 )
-from skillweave.collecting.cluster import Ray
-from skillweave.collecting.group import Collectors
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import SkillweaveError
+from skillweave.experience.group import Collectors
 from skillweave.runs.files import read_tensors
-from skillweave.seeding import Seeds
+from skillweave.workers.cluster import Ray
 
 ray = pytest.importorskip("ray")
 cluster_utils = pytest.importorskip("ray.cluster_utils")
 
-from skillweave.collecting import actors  # noqa: E402
-from skillweave.collecting.actor_host import COMPUTING, ActorHost  # noqa: E402
+from skillweave.workers import actors  # noqa: E402
+from skillweave.workers.actor_host import COMPUTING, ActorHost  # noqa: E402
 
 pytestmark = [
     pytest.mark.slow,

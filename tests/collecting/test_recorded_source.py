@@ -13,13 +13,13 @@ from reference_calls import Walk
 from toy_acting import Choices, requests
 from toys import alone_in
 
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Batch
 from skillweave.algorithms.config import DQN
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.source import Recorded
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import RunError
-from skillweave.experience import Batch
-from skillweave.seeding import Seeds
+from skillweave.experience.source import Recorded
 from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack
 from skillweave.training.loop import train

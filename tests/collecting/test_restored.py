@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from skillweave.collecting.restored import check_numbers, opened
+from skillweave.experience.restored import check_numbers, opened
 from skillweave.policies.core import CallEnd
 
 SPACE = gym.spaces.Discrete(5, start=1)

@@ -9,9 +9,9 @@ from reference_calls import POSITION, Counter, Left, Right, Zigzag, shy
 from toy_acting import Again, Choices, Counts, Given, requests, step
 from toys import alone_in, calling_in, skills_of
 
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
-from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")

@@ -11,14 +11,14 @@ import pytest
 from toy_acting import Choices, requests
 from toys import alone_in, skills_of
 
-from skillweave.collecting.search import Search, Starts
-from skillweave.collecting.skill_set import SkillSet
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError, TrainingError
+from skillweave.experience.search import Search, Starts
 from skillweave.policies.core import World
-from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 
 N = 3
 X, T = range(2)
@@ -219,7 +219,7 @@ def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
         drawn.append((n, None if mask is None else mask.tolist()))
         return np.full(n, 4)
 
-    monkeypatch.setattr("skillweave.collecting.search.random_actions", watched)
+    monkeypatch.setattr("skillweave.experience.search.random_actions", watched)
     skills = Forward(), OnlyFar()
     policies = tuple(skill.policy for skill in skills)
 

@@ -13,8 +13,8 @@ import torch
 
 from skillweave import SkillweaveError, from_onnx, recipes
 from skillweave.algorithms.config import _REGISTERED, config_to_json
-from skillweave.collecting import shipping
-from skillweave.collecting.shipping import packed, unpacked
+from skillweave.workers import shipping
+from skillweave.workers.shipping import packed, unpacked
 
 SPACES = gym.spaces.Box(-1.0, 1.0, (4,), np.float32), gym.spaces.Discrete(2)
 
@@ -63,7 +63,7 @@ class Own:
     answer = 7
 
 def send():
-    from skillweave.collecting.shipping import packed, unpacked
+    from skillweave.workers.shipping import packed, unpacked
 
     for _ in range(2):
         print(unpacked(packed(Own(), "it")).answer)
@@ -90,7 +90,7 @@ def test_a_recipe_arrives_where_neither_it_nor_what_it_imports_is(recipe, tmp_pa
     file.write_bytes(packed(recipes.load(recipe), "it"))
     code = (
         "import sys; from types import SimpleNamespace as S\n"
-        "from skillweave.collecting.shipping import unpacked\n"
+        "from skillweave.workers.shipping import unpacked\n"
         f"own = unpacked(open({str(file)!r}, 'rb').read())\n"
         "print(type(own.spec.make().unwrapped).__name__, own.skills[0].reward(S(reward=3.0)))\n"
     )
@@ -105,7 +105,7 @@ def test_a_recipe_that_lies_where_packages_are_installed_is_sent_as_well(tmp_pat
     file = tmp_path / "packed"
     file.write_bytes(packed(recipes.load("lunar-lander"), "it"))
     code = (
-        "from skillweave.collecting.shipping import unpacked\n"
+        "from skillweave.workers.shipping import unpacked\n"
         f"print(*[s.name for s in unpacked(open({str(file)!r}, 'rb').read()).skills])\n"
     )
     assert printed_elsewhere(code) == ["stabilize", "center", "landing"]
@@ -141,7 +141,7 @@ def test_environments_arrive_as_they_are_registered_here_whatever_they_are_calle
         gym.registry["CartPole-v1"] = known
     code = (
         "import gymnasium as gym\n"
-        "from skillweave.collecting.shipping import unpacked\n"
+        "from skillweave.workers.shipping import unpacked\n"
         f"unpacked(open({str(file)!r}, 'rb').read())\n"
         "print(*[gym.spec(n).max_episode_steps for n in ('ShortPole-v0', 'CartPole-v1')])\n"
     )
@@ -176,7 +176,7 @@ def test_an_algorithm_of_the_users_own_is_known_where_it_arrives(tmp_path, monke
     code = (
         "from skillweave.algorithms.config import config_from_json\n"
         "from skillweave.algorithms.registry import make_algorithm\n"
-        "from skillweave.collecting.shipping import unpacked\n"
+        "from skillweave.workers.shipping import unpacked\n"
         f"spaces = unpacked(open({str(file)!r}, 'rb').read())\n"
         f"config = config_from_json({config_to_json(mine.Mine())!r})\n"
         "print(type(make_algorithm(config, *spaces)).__name__)\n"

@@ -9,10 +9,10 @@ from scalar_skill import ScalarSkill
 from toy_acting import Again, Choices, Counts, Given, requests, step
 from toys import Ledger, actions, alone_in, cartpole
 
-from skillweave.collecting import search
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
-from skillweave.seeding import Seeds
+from skillweave.experience import search
 from skillweave.skills import Reflex, Skill
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")

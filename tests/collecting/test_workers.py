@@ -13,10 +13,10 @@ from living import alive, all_end
 from toy_acting import Given, requests
 from toys import alone_in
 
-from skillweave.collecting.processes import ProcessCollectors
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
-from skillweave.seeding import Seeds
+from skillweave.workers.processes import ProcessCollectors
 
 PID = 8  # the reward is the process
 

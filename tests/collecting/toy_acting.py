@@ -13,11 +13,11 @@ import numpy as np
 from reference_calls import EPISODE, Counter, Left, Right, Walk, Zigzag
 from toys import alone_in, calling_in, skills_of
 
-from skillweave.collecting.acting import Acted, Request
-from skillweave.collecting.collector import Collected, Collector
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Batch
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.experience import Batch
-from skillweave.seeding import Seeds
+from skillweave.experience.acting import Acted, Request
+from skillweave.experience.collector import Collected, Collector
 from skillweave.types import Array
 
 
