@@ -98,12 +98,8 @@ def begin(
     # An environment may change the working directory as it is made.
     given = options.run_dir
     place = absolute("." if given is None else as_path(given, "run_dir"))
-    content = replace(
-        content,
-        recipe=content.recipe or declared.recipe,
-        seed=options.seed,
-        track=tuple(options.track),
-    )
+    recipe = content.recipe or declared.recipe
+    content = replace(content, recipe=recipe, **options.for_manifest())
     with _surroundings(), called_by(declared._caller), ExitStack() as stack:
         stack.enter_context(collected_notices())  # the progress prints them later
         roles = _plan(declared, content, options)

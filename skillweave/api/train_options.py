@@ -6,12 +6,12 @@ import ast
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cache, wraps
 from itertools import pairwise
 from pathlib import Path
 from textwrap import fill
-from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, get_type_hints, overload
 
 import gymnasium as gym
 
@@ -21,6 +21,7 @@ from skillweave.api.starting import StartFrom
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.evolution.plan import Evolve
+from skillweave.runs.manifest import Manifest
 from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.training.callback import Callback, check_callback
 from skillweave.training.options import CallReports, Continuing, Reports, Starting
@@ -99,10 +100,12 @@ class AgentOptions(Going, Reports, Starting):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        seed = fitted(Count, self.seed, "seed")
+        for name, kind in get_type_hints(Starting).items():
+            kind = Count if name == "seed" else kind
+            object.__setattr__(self, name, fitted(kind, getattr(self, name), name))
         track = fitted(str | Sequence[str], self.track, "track")
         for word in ("resume", "overwrite"):
-            if fitted(bool, getattr(self, word), word) and self.run_dir is None:
+            if getattr(self, word) and self.run_dir is None:
                 raise DeclarationError(
                     f'{word}=True needs a run: name its directory, train("runs/a", {word}=True)'
                 )
@@ -111,8 +114,16 @@ class AgentOptions(Going, Reports, Starting):
                 "resume continues the run in run_dir, and overwrite replaces it: leave out one of "
                 "them"
             )
-        object.__setattr__(self, "seed", seed)
         object.__setattr__(self, "track", (track,) if isinstance(track, str) else tuple(track))
+
+    def for_manifest(self) -> dict[str, Any]:
+        """Return the options that a run's manifest records as they are given, by name.
+
+        Those on reports are in it already: the declaration's defaults complete them.
+        """
+        names = {f.name for f in fields(self)} & {f.name for f in fields(Manifest)}
+        names -= {f.name for f in fields(CallReports)}
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
