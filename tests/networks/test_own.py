@@ -22,7 +22,8 @@ from torch import nn
 from toys import Echo, drawn, learn
 
 import skillweave as sw
-from skillweave import DQN, PPO, RNN, SAC, TD3, Hierarchy, Network, SkillweaveError, named as naming
+from skillweave import DQN, PPO, RNN, SAC, TD3, Hierarchy, Network, SkillweaveError
+from skillweave._internal import named as naming
 from skillweave._internal.named import Named, named
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import config_from_json, config_to_json

@@ -437,7 +437,7 @@ def test_nothing_in_the_library_pickles_or_runs_text_as_code() -> None:
     users = {str(p.relative_to(LIBRARY)) for p in modules if "workers.shipping" in p.read_text()}
     senders = {
         "cli/sweep.py",
-        *(f"collecting/{n}.py" for n in ("actors", "processes", "actor_host")),
+        *(f"workers/{n}.py" for n in ("actors", "processes", "actor_host")),
     }
     others = {"api/recipe_file.py", "cli/sweep_code.py", "workers/start_methods.py"}
     assert users == senders | others
