@@ -1,6 +1,7 @@
 """A checkpoint whose checksum is right, but whose numbers cannot be gone on from, is refused."""
 
 import shutil
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 from scripts.torture.kinds import KINDS
 from scripts.torture.samples import unfinished
 from skillweave import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.runs.files import read_tensors, write_tensors
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
@@ -130,15 +132,31 @@ def test_numbers_that_are_never_written_are_refused(stopped, tmp_path, kind, nam
     assert str(run) in str(error.value)
 
 
+def test_a_checkpoint_without_its_population_is_refused(stopped, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(stopped("population, replay"), run)
+    with _rewritten(run) as (_, header):
+        del header["population"]
+    with pytest.raises(RunError, match="has no population"):
+        KINDS["population, replay"].declare().resume(run, quiet=True)
+
+
 def _change(run: Path, name: str, damage):
-    """Write the checkpoint anew with one tensor changed; there is none before it."""
+    """Change one tensor of the checkpoint."""
+    with _rewritten(run) as (tensors, _):
+        (full,) = [k for k in tensors if k.endswith(f".{name}")]
+        tensors[full] = damage(tensors[full])
+        if tensors[full] is None:
+            del tensors[full]
+
+
+@contextmanager
+def _rewritten(run: Path):
+    """Write the checkpoint anew, as the tensors and the header are then; none is before it."""
     (run / "checkpoint.previous.safetensors").unlink(missing_ok=True)
     path = run / "checkpoint.safetensors"
     tensors, header = read_tensors(path)
-    (full,) = [k for k in tensors if k.endswith(f".{name}")]
-    tensors[full] = damage(tensors[full])
-    if tensors[full] is None:
-        del tensors[full]
+    yield tensors, header
     header.pop("sha256", None)
     write_tensors(path, tensors, header, make_directories=False)
 

@@ -39,7 +39,7 @@ class SavedEvaluation:
 
     def to_json(self) -> dict[str, Any]:
         """Return the summary as plain JSON, with time, seed and kind of the evaluation."""
-        header = {k: value for k, value in vars(self).items() if k != "evaluation"}
+        header = {k: value for k, value in vars(self).items() if k not in ("evaluation", "run")}
         return header | self.evaluation.to_json()
 
 

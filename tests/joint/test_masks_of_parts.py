@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from reach import ON, SMALL, SPACES, Reach, Whole, reach
+from reach import ON, SMALL, SPACES, Arm, Grip, Reach, Whole, reach
 from small_runs import goes_on, reports_every
 from torch.distributions import Categorical, Normal
 
@@ -120,6 +120,11 @@ def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
         return reach(skills, env=masked("nested"), algorithm=algorithm, train_defaults=settings)
 
     goes_on(declared, tmp_path)
+
+
+def test_the_rest_of_the_action_may_be_forbidden(tmp_path):
+    with pytest.raises(SkillError, match=r"forbids the value 0 at choice 0 .* another rest"):
+        reach([Arm(), Grip()], env=masked()).train(tmp_path / "run", quiet=True)
 
 
 def test_choices_of_a_part_may_all_be_forbidden(tmp_path):
