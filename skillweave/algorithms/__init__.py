@@ -1,4 +1,8 @@
-"""Algorithms: one algorithm, one file; settings in ``config``."""
+"""Algorithms: how rows of experience become better weights, one file for each algorithm.
+
+Begin with ``ppo``. Settings of all are in ``config``, what they get in ``batches``, what they share
+in ``base`` and ``off_policy``.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,7 @@
-"""Environments: engines with one meaning of resets, and checks of environments."""
+"""Environments, many at once: engines that step and reset them, and checks of what they answer.
+
+Begin with ``engine``; ``make`` declares an environment and chooses its engine.
+"""
 
 from typing import TYPE_CHECKING
 

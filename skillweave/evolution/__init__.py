@@ -1,4 +1,7 @@
-"""Evolution: a population that learns in stacks, is compared, selected and mutated."""
+"""Evolution: a population that learns in stacks, is compared, selected and mutated.
+
+Begin with ``population``, a generation from start to end; ``stage`` trains one in a run.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,7 @@
-"""Skills and reflexes, which users declare."""
+"""What users declare: skills, reflexes, ready selectors, and policies from elsewhere.
+
+Begin with ``base``, the classes; ``skill_set`` makes policies of the skills below a selector.
+"""
 
 from skillweave.policies.core import LastCall
 from skillweave.skills import tree
