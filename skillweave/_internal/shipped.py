@@ -9,7 +9,7 @@ from pathlib import Path
 
 from skillweave.errors import DeclarationError
 
-FOLDER = Path(__file__).parent / "recipes"
+FOLDER = Path(__file__).parents[1] / "recipes"
 """Where recipes are shipped."""
 
 

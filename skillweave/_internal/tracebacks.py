@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
 
-LIBRARY = Path(__file__).parent
+LIBRARY = Path(__file__).parents[1]
 RECIPES = LIBRARY / "recipes"
 """Shipped recipes are examples of what a user writes, so their lines count as the user's."""
 SWITCH = "SKILLWEAVE_TRACEBACK"
