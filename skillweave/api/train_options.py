@@ -121,7 +121,7 @@ class AgentOptions(Going, Reports, Starting):
 
         Those on reports are in it already: the declaration's defaults complete them.
         """
-        names = {f.name for f in fields(self)} & {f.name for f in fields(Manifest)}
+        names = {f.name for f in fields(AgentOptions)} & {f.name for f in fields(Manifest)}
         names -= {f.name for f in fields(CallReports)}
         return {name: getattr(self, name) for name in names}
 
