@@ -41,7 +41,7 @@ from skillweave.runs.initial_policies import (
     record_initial_policies,
 )
 from skillweave.training import stage_log
-from skillweave.training.joint_learner import JointLearner
+from skillweave.training.joint import JointLearner
 
 STILL = 1e-12
 """A learning rate by which nothing moves."""

@@ -46,8 +46,8 @@ from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api import Agent, Run, train_agent
 from skillweave.cli import commands, execute
-from skillweave.compat.agent_files import load_agent
 from skillweave.compat.agilerl_files import convert
+from skillweave.compat.single_agent import load_agent
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory

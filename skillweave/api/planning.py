@@ -23,7 +23,7 @@ from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.settings import Guide, Selection
 from skillweave.planning import Planner, successes
 from skillweave.planning.calls import seen_places
-from skillweave.planning.mission_text import RESERVED
+from skillweave.planning.mission import RESERVED
 from skillweave.planning.neighbors import FEATURES
 from skillweave.planning.predicates import WORD
 from skillweave.planning.task_env import OwnView, Tasked

@@ -17,8 +17,8 @@ from torch import Tensor
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import DQN, PPO, TD3
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.compat.agent_files import save_agent
 from skillweave.compat.pickles import read_torch_pickle
+from skillweave.compat.single_agent import save_agent
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.stacked import Views

@@ -21,8 +21,8 @@ from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.planning import Planner
 from skillweave.runs.command_words import repair_words, resume_words
-from skillweave.runs.copies import copy_ready_policy, policy_at_start
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.initial_policies import copy_ready_policy, policy_at_start
 from skillweave.runs.manifest import Manifest
 from skillweave.runs.trackers import Listener
 from skillweave.skills import ready_policy

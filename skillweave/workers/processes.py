@@ -28,10 +28,9 @@ from skillweave.workers.host import (
     Workers,
     environments_of,
 )
-from skillweave.workers.process_groups import end_group
 from skillweave.workers.shipping import packed, unpacked
 from skillweave.workers.start_methods import GUARD
-from skillweave.workers.worker_process import TorchModes, work
+from skillweave.workers.worker_process import TorchModes, end_group, work
 
 PATIENCE = 1.0
 """Seconds that workers have to end by themselves when they are closed."""

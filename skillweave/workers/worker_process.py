@@ -1,4 +1,4 @@
-"""The main function of a worker process."""
+"""The main function of a worker process, and its group: it and what its environments start."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from time import monotonic, sleep
 from types import FrameType
 from typing import Any, NoReturn
 
+from skillweave._internal.interrupts import handle_here
 from skillweave._internal.notices import Notices, collect_notices
-from skillweave._internal.signals import handle_here
 from skillweave.workers.channel import Channel
 from skillweave.workers.host import SentError, WorkerHost, error_to_send
-from skillweave.workers.process_groups import kill_group, lead_group
 
 LOOK = 1.0
 """Seconds between checks that the parent lives."""
@@ -180,3 +179,39 @@ def _end_children() -> None:
             child.join(max(0.0, until - monotonic()))
             if child.is_alive():
                 getattr(child, end)()
+
+
+PATIENCE = 0.3
+"""Seconds that processes have to end at SIGTERM."""
+
+
+def lead_group() -> None:
+    """Let this process lead a group of its own, to which the processes that it starts belong."""
+    with suppress(OSError):  # it leads a session
+        os.setpgid(0, 0)
+
+
+def kill_group() -> None:
+    """Kill this process and its group; only itself where the group is another one's."""
+    if os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def end_group(leader: int) -> None:
+    """End the processes that are left in the group of a process that has ended."""
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        if not _signalled(leader, number):
+            return
+        until = monotonic() + PATIENCE
+        while _signalled(leader, 0) and monotonic() < until:
+            sleep(0.01)
+
+
+def _signalled(group: int, number: int) -> bool:
+    """Send a signal to a group; return False if it has no processes."""
+    try:
+        os.killpg(group, number)
+    except (ProcessLookupError, PermissionError):  # the latter on macOS, of zombies
+        return False
+    return True

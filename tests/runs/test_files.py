@@ -428,7 +428,7 @@ def test_nothing_in_the_library_pickles_or_runs_text_as_code() -> None:
     source = (LIBRARY / "compat/pickles.py").read_text()
     assert re.findall(r"\bpickle\.\w+", source) == ["pickle.Unpickler"]
     # The one that sends the user's own code to processes of the same user, as multiprocessing does:
-    # no file is ever read by it, and only these send and receive (``sweep_code`` asks it which
+    # no file is ever read by it, and only these send and receive (``sweep`` asks it which
     # modules are the user's own, ``recipe_file`` names a recipe's folder, and
     # ``start_methods`` asks what another process would import).
     assert len(found.pop("workers/shipping.py")) == 2
@@ -439,7 +439,7 @@ def test_nothing_in_the_library_pickles_or_runs_text_as_code() -> None:
         "cli/sweep.py",
         *(f"workers/{n}.py" for n in ("actors", "processes", "actor_host")),
     }
-    others = {"api/recipe_file.py", "cli/sweep_code.py", "workers/start_methods.py"}
+    others = {"api/recipe_file.py", "cli/sweep.py", "workers/start_methods.py"}
     assert users == senders | others
     # Messages between a run and its own workers, through pipes that only they have.
     assert len(found.pop("workers/channel.py")) == 1

@@ -12,7 +12,7 @@ from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.batches import Batch
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.training.joint_learner import JointLearner, how_it_acted
+from skillweave.training.joint import JointLearner, how_it_acted
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.types import Array
 
