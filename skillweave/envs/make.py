@@ -111,6 +111,7 @@ class EnvSpec:
     # These do not make a different environment.
     obs_names: Names | None = field(default=None, compare=False, repr=False)
     check_seed: bool = field(default=True, compare=False, repr=False)
+    _spaces: Spaces | None = field(default=None, init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if is_batched(self.env):
@@ -120,8 +121,7 @@ class EnvSpec:
     @property
     def spaces(self) -> Spaces:
         """Return the environment's spaces; the first time, make one to read them."""
-        known: Spaces | None = vars(self).get("_spaces")
-        return self.read_spaces() if known is None else known
+        return self._spaces or self.read_spaces()
 
     @global_generators(Seeds(0) / "spaces")
     def read_spaces(self) -> Spaces:
@@ -136,7 +136,7 @@ class EnvSpec:
         return spaces
 
     def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in vars(self).items() if k != "_spaces"}
+        return vars(self) | {"_spaces": None}
 
     def make(self, render_mode: str | None = None, number: int | None = None) -> CheckedEnv:
         """Make one environment, whose errors name it and its ``number``.

@@ -45,6 +45,7 @@ class Declared(InEnv, ABC):
     """The place of the declaration: a shipped recipe's name or a file; written into runs."""
     recorded = False
     """True for a run that was loaded without its code; some of what was declared is missing."""
+    _spec: EnvSpec | None = None
     _starts: Callable[[], Any] | None = None
     """Function that returns the policies with which learners start, by name; None: no function."""
 
@@ -64,10 +65,9 @@ class Declared(InEnv, ABC):
         """The environment, fully specified; the same object while ``env`` does not change."""
         if isinstance(self.env, EnvSpec):
             return self.env
-        known: EnvSpec | None = vars(self).get("_spec")
-        if known is None or known.env is not self.env:
-            known = vars(self)["_spec"] = EnvSpec(self.env)
-        return known
+        if self._spec is None or self._spec.env is not self.env:
+            self._spec = EnvSpec(self.env)
+        return self._spec
 
     @abstractmethod
     def check_spaces(self) -> Spaces:
