@@ -20,12 +20,12 @@ import torch
 
 import skillweave as sw
 from benchmarks.common import median, report, table
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.hierarchy.fitting import ready_policies
 from skillweave.hierarchy.roles import roles_of
-from skillweave.seeding import Seeds
 from skillweave.skills.goal_spaces import with_goal
+from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Array, HierarchyPolicy
 
 ENV = "CartPole-v1"

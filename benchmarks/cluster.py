@@ -40,9 +40,9 @@ import numpy as np
 from benchmarks.collecting import EPOCHS, NETWORK, grid, ours
 from benchmarks.common import report, table
 from skillweave import PPO, EnvSpec, Network, Ray, train_agent
-from skillweave.collecting.cluster import imported
 from skillweave.evolution import Evolution
 from skillweave.types import Array
+from skillweave.workers.cluster import imported
 
 SLEEP = 2e-3
 EACH, ROWS = 4, 64
@@ -320,8 +320,8 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
     """Return a step's costs in microseconds of one processor, and its bytes."""
     import ray
 
+    from skillweave._internal.seeding import Seeds
     from skillweave.algorithms.policy import make_algorithm
-    from skillweave.seeding import Seeds
     from skillweave.training.learner import RolloutLearner, Stack
     from skillweave.training.learning_task import skill_task
     from skillweave.training.role import agent_role

@@ -14,8 +14,8 @@ from typing import Any
 from benchmarks.bare import train_bare
 from benchmarks.common import median, report, table, warm_up
 from skillweave import recipes
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
 from skillweave.training.evaluation import evaluate
 from skillweave.training.learner import Stack

@@ -51,18 +51,18 @@ from skillweave import (
     Skill,
     TrainDefaults,
 )
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Batch
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.collector import Collector
-from skillweave.collecting.group import Collectors
-from skillweave.collecting.learners import Calling
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import RawStep
-from skillweave.experience import Batch
+from skillweave.experience.acting import Acting, Request
+from skillweave.experience.collector import Collector
+from skillweave.experience.group import Collectors
+from skillweave.experience.learners import Calling
 from skillweave.hierarchy.roles import CALL
-from skillweave.seeding import Seeds
 from skillweave.skills import ready_policy
+from skillweave.skills.skill_set import SkillSet
 from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack
 from skillweave.training.loop import train

@@ -20,7 +20,7 @@ import torch
 from benchmarks.bare import train_bare
 from benchmarks.common import median, report, table
 from skillweave import DQN, SAC, TD3, EnvSpec, Network
-from skillweave.seeding import Seeds
+from skillweave._internal.seeding import Seeds
 from skillweave.training.episodes import Tick
 
 SIZES = {

@@ -28,11 +28,11 @@ import torch
 from benchmarks.common import median, report, run_command, table, warm_up
 from benchmarks.updates import rollout, seconds
 from skillweave import PPO, EnvSpec, Network
+from skillweave._internal.seeding import Seeds
 from skillweave.evolution import Evolution
 from skillweave.evolution.architecture import Change, rebuilt
 from skillweave.evolution.population import Population
 from skillweave.evolution.stacks import Member, join, split
-from skillweave.seeding import Seeds
 from skillweave.training.learning_task import skill_task
 from skillweave.training.role import agent_role
 

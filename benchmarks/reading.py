@@ -21,10 +21,10 @@ from typing import Any
 
 import skillweave
 from skillweave import PPO, SAC, EnvSpec, SkillweaveError
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.registry import make_algorithm
-from skillweave.collecting.acting import Acting
-from skillweave.collecting.group import Collectors
-from skillweave.seeding import Seeds
+from skillweave.experience.acting import Acting
+from skillweave.experience.group import Collectors
 from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack
 from skillweave.training.learning_task import skill_task

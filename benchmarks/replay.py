@@ -57,8 +57,8 @@ def filled(transitions: int, add: Callable[..., None]) -> float:
 def ours(transitions: int, **kwargs: Any) -> dict[str, float]:
     import torch
 
+    from skillweave.algorithms.batches import Batch
     from skillweave.buffers.replay import ReplayStore
-    from skillweave.experience import Batch
 
     torch.set_num_threads(1)
     before = resident()

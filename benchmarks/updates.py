@@ -11,9 +11,9 @@ import torch
 
 from benchmarks.common import report, table
 from skillweave import PPO, Network
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Rollout
 from skillweave.algorithms.ppo import PPOAlgorithm
-from skillweave.experience import Rollout
-from skillweave.seeding import Seeds
 
 
 def rollout(members: int, samples: int) -> Rollout:

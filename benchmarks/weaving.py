@@ -22,8 +22,8 @@ from benchmarks.bare import train_bare
 from benchmarks.common import median, report, table, warm_up
 from benchmarks.grouped import regroup
 from skillweave import recipes
+from skillweave._internal.seeding import Seeds
 from skillweave.recipes import lander_missions as missions
-from skillweave.seeding import Seeds
 
 EPISODES, FLAT_STEPS = 50, 200_000
 

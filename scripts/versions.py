@@ -41,7 +41,7 @@ TESTS = (
     "tests/algorithms/test_ppo.py",
     "tests/calls",
     "tests/cli/test_cli.py",
-    "tests/collecting/test_skill_rows.py",
+    "tests/experience/test_skill_rows.py",
     "tests/envs/test_engine.py",
     "tests/envs/test_make.py",
     "tests/hierarchy/test_options.py",

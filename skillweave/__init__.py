@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from skillweave.public import lazy
+from skillweave._internal.public import lazy
 
 __version__ = "0.1.0"
 
@@ -25,15 +25,12 @@ if TYPE_CHECKING:
     from skillweave.api.options import make_options_env as make_options_env
     from skillweave.api.player import Player as Player
     from skillweave.api.policies import load_policy as load_policy, save_policy as save_policy
-    from skillweave.collecting.cluster import Ray as Ray
-    from skillweave.collecting.lengths import Lengths as Lengths
     from skillweave.envs.make import EnvSpec as EnvSpec
     from skillweave.envs.pool import envpool as envpool
     from skillweave.errors import SkillweaveError as SkillweaveError
     from skillweave.hierarchy.settings import Apart as Apart, Guide as Guide, Selection as Selection
     from skillweave.networks.config import CNN as CNN, RNN as RNN, Network as Network
     from skillweave.reporting.curves_figure import plot_curves as plot_curves
-    from skillweave.selectors import Automaton as Automaton, tree as tree
     from skillweave.skills import (
         Reflex as Reflex,
         Residual as Residual,
@@ -42,7 +39,10 @@ if TYPE_CHECKING:
         from_onnx as from_onnx,
         from_sb3 as from_sb3,
         from_torch as from_torch,
+        tree as tree,
     )
+    from skillweave.skills.automaton import Automaton as Automaton
+    from skillweave.skills.lengths import Lengths as Lengths
     from skillweave.skills.mapping import (
         Acts as Acts,
         Goal as Goal,
@@ -53,5 +53,6 @@ if TYPE_CHECKING:
     from skillweave.training.evaluation import evaluate as evaluate
     from skillweave.training.stage import Together as Together
     from skillweave.types import Step as Step
+    from skillweave.workers.cluster import Ray as Ray
 else:
     __all__, __getattr__, __dir__ = lazy(__name__)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from skillweave._internal.tracebacks import ShortTraceback
 from skillweave.policies.errors import (
     DeclarationError as DeclarationError,
     PolicyError as PolicyError,
@@ -17,7 +18,6 @@ from skillweave.policies.errors import (
     SkillweaveError as SkillweaveError,
     printable,
 )
-from skillweave.tracebacks import ShortTraceback
 
 SkillweaveError._render_traceback_ = ShortTraceback._render_traceback_  # type: ignore[attr-defined]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
 from typing import (
@@ -30,9 +30,9 @@ from typing import (
 
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short, suggest
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
-from skillweave.messages import short, suggest
 from skillweave.policies.files import shown
 
 C = TypeVar("C", bound=type[Any])
@@ -309,7 +309,7 @@ class _Fitting:
         hints = annotations_of(kind)
         needed = {name for name, hint in hints.items() if get_origin(hint) is not NotRequired}
         if is_dataclass(kind):
-            own = fields(kind)
+            own = saved_fields(kind)
             needed = {f.name for f in own if f.default is f.default_factory is MISSING}
             if unknown := sorted(values.keys() - {f.name for f in own}):
                 raise RunError(
@@ -431,12 +431,21 @@ def to_json(value: Any, where: str, advice: str) -> Any:
     )
 
 
+UNSAVED = {"saved": False}
+"""The metadata of a field that files do not hold."""
+
+
+def saved_fields(kind: Any) -> list[Field[Any]]:
+    """Return the fields of a dataclass that files hold."""
+    return [f for f in fields(kind) if f.metadata.get("saved", True)]
+
+
 def as_json(value: Any) -> Any:
     """Return a record of a file as plain JSON, without fields that are None or empty by default."""
     if is_dataclass(value):
         return {
             f.name: as_json(content)
-            for f in fields(value)
+            for f in saved_fields(value)
             if (content := getattr(value, f.name)) not in (None, [], (), {})
             or f.default is f.default_factory is MISSING
         }

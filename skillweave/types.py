@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 import numpy as np
 from gymnasium import Space
 
+from skillweave._internal.public import lazy
+from skillweave._internal.seeding import Seeds as Seeds
 from skillweave.policies.core import (
     Array as Array,
     LastCall as LastCall,
     Step as Step,
     read_only as read_only,
 )
-from skillweave.public import lazy
-from skillweave.seeding import Seeds as Seeds
 
 if TYPE_CHECKING:
     from skillweave.export.write import Export as Export

@@ -7,8 +7,8 @@ from typing import Any
 
 from benchmarks.grouped import grouped
 from skillweave import Guide, Hierarchy, Together
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.hierarchy.roles import roles_of
+from skillweave.skills.skill_set import SkillSet
 
 
 def plainly(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import beartype
 import jaxtyping
 import torch
 
-from skillweave import shapes
+from skillweave._internal import shapes
 
 
 def check_shapes(*modules: str) -> None:

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 import skillweave as sw
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.public import HOMES
 from skillweave.errors import DeclarationError
-from skillweave.public import HOMES
 
 
 @checked_names

@@ -13,8 +13,8 @@ from small_runs import ON, Heard, StopAt, Stopped, assert_same, new_run
 from test_together import declare
 
 from skillweave import Automaton, SkillweaveError, Together
-from skillweave.collecting import search
 from skillweave.envs.make import EnvSpec
+from skillweave.experience import search
 from skillweave.hierarchy import training
 from skillweave.skills import Skill
 from skillweave.training.stage_log import StageLog

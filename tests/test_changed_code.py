@@ -17,10 +17,10 @@ import pytest
 from shared_runs import SMALL
 
 import skillweave as sw
-from skillweave.collecting.user_code import changes, code_sum, environment_texts, skill_texts
 from skillweave.errors import RunError
 from skillweave.planning import CallLog, Mission, Planner, join
 from skillweave.runs.directory import CALLS
+from skillweave.runs.user_code import changes, code_sum, environment_texts, skill_texts
 
 SOURCE = '''
 import json
@@ -181,8 +181,7 @@ def test_use_place_and_process_change_nothing(edited: Any, tmp_path: Path) -> No
         assert not changes(before, now) + changes(now, before)
     main = tmp_path / "main.py"
     main.write_text(
-        SOURCE
-        + "from skillweave.collecting.user_code import *\nprint(json.dumps(environment_texts("
+        SOURCE + "from skillweave.runs.user_code import *\nprint(json.dumps(environment_texts("
         "sw.EnvSpec(Room)) | skill_texts({'move': skill(1)}, ())))"
     )
     env = os.environ | {"PYTHONHASHSEED": "7", "PYTHONPATH": os.pathsep.join(sys.path)}

@@ -18,7 +18,7 @@ import pytest
 from small_runs import MEMORY, OFF, ON, Balance, Left, Push, assert_same, plain_recipe
 
 from skillweave import DQN, SAC, Agent, Apart, EnvSpec, Hierarchy, Network, Together, TrainDefaults
-from skillweave.collecting import interrupts
+from skillweave._internal import interrupts
 from skillweave.evolution import Evolution
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.loop import _Loop

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 import skillweave as sw
-from skillweave.collecting.workers import error_to_send
 from skillweave.errors import (
     KINDS,
     EnvError,
@@ -20,6 +19,7 @@ from skillweave.errors import (
     make_error,
     reworded,
 )
+from skillweave.workers.host import error_to_send
 
 ROOT = Path(__file__).parents[1] / "skillweave"
 

@@ -128,9 +128,9 @@ def adapter():
 
 def test_stable_baselines3_is_told_final_observations_and_time_limits():
     from skillweave import EnvSpec
-    from skillweave.collecting.skill_set import SkillSet
     from skillweave.envs import OptionsEnv
     from skillweave.envs.make import make_engine
+    from skillweave.skills.skill_set import SkillSet
 
     module = adapter()
     skills = (module.DriftLeft(), module.DriftRight())

@@ -10,7 +10,7 @@ from test_together import Other, declare
 from skillweave import SkillweaveError
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
-from skillweave.training.joint_learner import JointLearner
+from skillweave.training.joint import JointLearner
 
 
 def then(**how):

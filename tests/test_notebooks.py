@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from small_runs import stage_entry
 
-from skillweave import PPO, Agent, Hierarchy, Network, Run, Skill, notebooks as module, tree
-from skillweave.notebooks import facts, in_notebook, joined, table
+from skillweave import PPO, Agent, Hierarchy, Network, Run, Skill, tree
+from skillweave._internal import notebooks as module
+from skillweave._internal.notebooks import facts, in_notebook, joined, table
 from skillweave.reporting.progress import EpisodeProgress, Progress
 from skillweave.reporting.video import Film
 from skillweave.types import Evaluation

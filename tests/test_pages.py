@@ -10,8 +10,8 @@ import pytest
 from hub_server import go_to, serve
 from pages import BLOCK, INCLUDED, ROOT, run_page, train_briefly
 
+from skillweave._internal.public import HOMES
 from skillweave.cli.commands import COMMANDS, name_of
-from skillweave.public import HOMES
 
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 NEEDS = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skillweave.paths import (
+from skillweave._internal.paths import (
     below,
     decides,
     is_below,

@@ -15,8 +15,8 @@ import pytest
 import torch
 
 import skillweave as sw
-from skillweave.collecting import processes
-from skillweave.collecting.workers import Workers
+from skillweave.workers import processes
+from skillweave.workers.host import Workers
 
 SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((4,)))
 

@@ -17,9 +17,9 @@ import pytest
 from pages import BLOCK, train_briefly
 
 from skillweave import SkillweaveError
+from skillweave._internal.public import HOMES
 from skillweave.cli.commands import COMMANDS
 from skillweave.errors import KINDS
-from skillweave.public import HOMES
 from skillweave.types import Array, Policy
 
 ALIASES = ("Array",)

@@ -11,7 +11,7 @@ import pytest
 
 import skillweave as sw
 from skillweave import SkillweaveError
-from skillweave.public import HOMES
+from skillweave._internal.public import HOMES
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))

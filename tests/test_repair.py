@@ -17,8 +17,8 @@ from small_runs import assert_same, stage_entry
 import skillweave as sw
 from skillweave.algorithms import ppo
 from skillweave.api import Run, repairing
-from skillweave.collecting.collector import Collector
 from skillweave.errors import DeclarationError, Interrupted, RunError
+from skillweave.experience.collector import Collector
 from skillweave.hierarchy import repair
 from skillweave.hierarchy.roles import roles_of
 from skillweave.planning import Handover, Mission, held, record_calls

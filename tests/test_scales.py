@@ -9,13 +9,13 @@ import pytest
 import torch
 
 import skillweave
+from skillweave._internal.notices import collected_notices
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import config
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
-from skillweave.notices import collected_notices
 from skillweave.ops.moments import explained_variance, merge_moments, normalize, scale_of
 from skillweave.planning.neighbors import FeatureMap, Standard
-from skillweave.seeding import Seeds
 
 ROOT = Path(skillweave.__file__).parent
 DEVIATION = re.compile(r"\b(nan)?(std|var|var_mean|std_mean)\(|var\b.*sqrt\(|sqrt\(.*(\b|_)var\b")

@@ -3,7 +3,7 @@ import pytest
 import torch
 from hypothesis import assume, given, strategies as st
 
-from skillweave.seeding import Seeds
+from skillweave._internal.seeding import Seeds
 
 paths = st.lists(st.one_of(st.text(max_size=8), st.integers(0, 2**20)), max_size=4)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from pages import ROOT
 
-from skillweave.public import HOMES
+from skillweave._internal.public import HOMES
 
 pytestmark = pytest.mark.slow
 

@@ -28,8 +28,8 @@ from skillweave import (
     TrainDefaults,
 )
 from skillweave.cli import main
-from skillweave.collecting.acting import Acting
 from skillweave.errors import RunError
+from skillweave.experience.acting import Acting
 from skillweave.hierarchy import training
 from skillweave.reporting.report.facts import settings
 from skillweave.runs import initial_policies
@@ -41,7 +41,7 @@ from skillweave.runs.initial_policies import (
     record_initial_policies,
 )
 from skillweave.training import stage_log
-from skillweave.training.joint_learner import JointLearner
+from skillweave.training.joint import JointLearner
 
 STILL = 1e-12
 """A learning rate by which nothing moves."""

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from skillweave.public import HOMES
+from skillweave._internal.public import HOMES
 
 ROOT = Path(__file__).parents[1] / "skillweave"
 MODULES = sorted(ROOT.rglob("*.py"))
@@ -30,16 +30,16 @@ BASE = {
     "messages",
     "notices",
     "signals",
+    "interrupts",
     "arguments",
     "named",
     "schema",
-    "experience",
     "shapes",
     "paths",
 }
 USED = {"algorithms", "envs", "errors", "evolution", "types"}  # users import from these, too
 LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
-LEARNING |= {"collecting", "selectors", "planning"}
+LEARNING |= {"experience", "workers", "planning"}
 EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "export"}
 EVERYTHING |= {"shipped", "api"}
 ROOMS: dict[str, set[str]] = {
@@ -59,19 +59,21 @@ ROOMS: dict[str, set[str]] = {
     "arguments": {"errors", "types", "messages"},
     "named": {"errors", "types", "messages"},
     "schema": {"errors", "types", "messages", "arguments", "policies"},
-    "experience": {"types", "paths"},
+    "_internal": set(),
+    "interrupts": {"signals", "terminal"},
     "ops": BASE,
     "spaces": BASE,
     "skills": BASE | {"ops", "spaces"},
     "networks": BASE | {"ops", "spaces"},
     "toys": set(),
     "envs": BASE | {"spaces", "skills", "toys"},
-    "buffers": BASE | {"ops", "spaces", "experience"},
+    "buffers": BASE | {"ops", "spaces", "algorithms"},
     "algorithms": BASE | {"ops", "spaces", "networks"},
-    "collecting": BASE | {"spaces", "skills", "envs", "algorithms"},
-    "selectors": BASE | {"spaces", "skills", "collecting"},
-    "runs": BASE | {"algorithms", "skills"},
-    "planning": BASE | {"ops", "spaces", "skills", "envs", "collecting", "selectors", "runs"},
+    "experience": BASE | {"spaces", "skills", "envs", "algorithms"},
+    "workers": BASE | {"envs", "algorithms", "experience"},
+    "runs": BASE | {"algorithms", "skills", "envs"},
+    "planning": BASE
+    | {"ops", "spaces", "skills", "envs", "algorithms", "experience", "workers", "runs"},
     "training": LEARNING,
     "hierarchy": LEARNING | {"training"},
     "evolution": LEARNING | {"training"},
@@ -119,7 +121,12 @@ def module_of(path: Path) -> str:
     """``algorithms.ppo`` for skillweave/algorithms/ppo.py; ``skillweave`` for the package."""
     parts = path.relative_to(ROOT).with_suffix("").parts
     parts = parts[:-1] if parts[-1] == "__init__" else parts
-    return ".".join(parts) or "skillweave"
+    return name_of(".".join(parts)) or "skillweave"
+
+
+def name_of(module: str) -> str:
+    """A module's name in the rows here: those of ``_internal`` are rooms of their own."""
+    return module.removeprefix("skillweave.").removeprefix("_internal.")
 
 
 def room_of(module: str) -> str:
@@ -154,12 +161,12 @@ def imported(source: str, module: str, package: bool) -> Iterator[tuple[int, str
                 base = ".".join([*stem, *([node.module] if node.module else [])])
             deeper = [f"{base}.{a.name}" for a in node.names]
             # `from skillweave import recipes` imports a room, `… import PPO` the public names.
-            names = [d if d.removeprefix("skillweave.") in NAMES else base for d in deeper]
+            names = [d if name_of(d) in NAMES else base for d in deeper]
         elif isinstance(node, ast.Call) and "import_module" in ast.dump(node.func):
             names = [a.value for a in node.args if isinstance(a, ast.Constant)]
         for name in names:
             if name == "skillweave" or name.startswith("skillweave."):
-                yield node.lineno, name.removeprefix("skillweave.")
+                yield node.lineno, name_of(name)
 
 
 def violations(source: str, module: str, package: bool = False) -> list[str]:
@@ -191,10 +198,10 @@ def violations(source: str, module: str, package: bool = False) -> list[str]:
         ("envs.make", "import skillweave.runs.files as files"),
         ("envs.make", "def f():\n    from skillweave.algorithms.ppo import State"),
         ("envs.make", "if TYPE_CHECKING:\n    from skillweave.api import Run"),
-        ("envs.make", "from ..collecting import skill_set"),
-        ("collecting.skill_set", "from skillweave.training.learner import Learner"),
-        ("collecting.skill_set", "from skillweave.hierarchy.options import OptionsEnv"),
-        ("buffers.replay", "from skillweave.collecting.collector import Collected"),
+        ("envs.make", "from ..experience import judge"),
+        ("skills.skill_set", "from skillweave.training.learner import Learner"),
+        ("skills.skill_set", "from skillweave.hierarchy.options import OptionsEnv"),
+        ("buffers.replay", "from skillweave.experience.collector import Collected"),
         ("envs.make", "from skillweave import PPO"),
         ("envs.make", "from skillweave import recipes"),
         ("envs.make", "importlib.import_module('skillweave.runs')"),
@@ -204,7 +211,7 @@ def violations(source: str, module: str, package: bool = False) -> list[str]:
         ("networks.config", "from skillweave.networks.stacked import mlp"),
         ("seeding", "from skillweave.types import Step"),
         ("reporting.plots", "from skillweave.compat import x"),
-        ("recipes.x", "from skillweave.collecting.skill_set import SkillSet"),
+        ("recipes.x", "from skillweave.skills.skill_set import SkillSet"),
         ("api.declared", "def f():\n    from skillweave import recipes"),
     ],
 )
@@ -221,10 +228,10 @@ def test_the_search_finds_an_import_against_the_order(module: str, source: str) 
         ("algorithms.config", "from skillweave.networks.config import Network"),
         ("recipes.x", "from skillweave import PPO, Hierarchy"),
         ("cli.execute", "from skillweave import recipes"),
-        ("ops.returns", "from skillweave.seeding import Seeds"),
-        ("collecting.acting", "from skillweave.algorithms.base import Algorithm"),
-        ("training.loop", "from skillweave.collecting.group import Collectors"),
-        ("hierarchy.options", "from skillweave.collecting.skill_set import SkillSet"),
+        ("ops.returns", "from skillweave._internal.seeding import Seeds"),
+        ("experience.acting", "from skillweave.algorithms.base import Algorithm"),
+        ("training.loop", "from skillweave.experience.group import Collectors"),
+        ("hierarchy.options", "from skillweave.skills.skill_set import SkillSet"),
     ],
 )
 def test_the_search_lets_pass_what_the_order_allows(module: str, source: str) -> None:
@@ -292,7 +299,11 @@ def test_a_module_imports_only_what_its_row_names(path: Path) -> None:
 
 
 def test_settings_and_commands_need_neither_torch_nor_a_heavy_room() -> None:
-    modules = [*(f"skillweave.{name}" for name in LEAVES), "skillweave", "skillweave.seeding"]
+    modules = [
+        *(f"skillweave.{name}" for name in LEAVES),
+        "skillweave",
+        "skillweave._internal.seeding",
+    ]
     modules += ["skillweave.types", "skillweave.cli.commands"]
     code = "import importlib, sys\n"
     code += "".join(f"importlib.import_module({name!r})\n" for name in modules)

@@ -16,9 +16,9 @@ import gymnasium as gym
 import pytest
 
 from skillweave import Agent, Hierarchy, SkillweaveError
+from skillweave._internal.terminal import one_line, printable
 from skillweave.cli import main
 from skillweave.runs.files import read_json, write_json
-from skillweave.terminal import one_line, printable
 from tests.small_runs import ON, Left, policies
 
 STEPS = 96

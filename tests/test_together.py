@@ -133,7 +133,8 @@ def test_all_who_learn_change_and_all_who_are_ready_stay(whole):
 @pytest.mark.slow
 def test_two_workers_are_as_two_collectors_in_this_thread(tmp_path, monkeypatch):
     declare(workers=2).train(tmp_path / "processes", seed=3, quiet=True)
-    from skillweave.collecting import group, placement
+    from skillweave.experience import group
+    from skillweave.workers import placement
 
     def here(make, num_envs, workers, members, name):
         each = num_envs // workers

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from skillweave import PPO, EnvSpec, Hierarchy, Skill, evaluate
+from skillweave._internal.messages import error_text
+from skillweave._internal.tracebacks import LIBRARY, place
 from skillweave.errors import EnvError, PolicyError, SkillError
-from skillweave.messages import error_text
 from skillweave.skills.outputs import blame
-from skillweave.tracebacks import LIBRARY, place
 from skillweave.types import Memoryless
 
 HERE = Path(__file__).name

@@ -15,21 +15,21 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.config import PPO, AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.acting import Acting
-from skillweave.collecting.collector import Collector
-from skillweave.collecting.group import Collectors
-from skillweave.collecting.learners import Alone, Calling
-from skillweave.collecting.search import Starts
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import RawStep
-from skillweave.experience import Sample
+from skillweave.experience.acting import Acting
+from skillweave.experience.collector import Collector
+from skillweave.experience.group import Collectors
+from skillweave.experience.learners import Alone, Calling
+from skillweave.experience.search import Starts
 from skillweave.networks.stacked import Layout
-from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 from skillweave.spaces import pack
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Learner, Stack

@@ -42,16 +42,16 @@ from skillweave import (
     Skill,
     from_onnx,
 )
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api import Agent, Run, train_agent
 from skillweave.cli import commands, execute
-from skillweave.compat.agent_files import load_agent
 from skillweave.compat.agilerl_files import convert
+from skillweave.compat.single_agent import load_agent
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory
 from skillweave.schema import as_json
-from skillweave.seeding import Seeds
 from skillweave.spaces import pack
 from skillweave.types import Policy
 

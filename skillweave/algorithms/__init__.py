@@ -1,8 +1,12 @@
-"""Algorithms: one algorithm, one file; settings in ``config``."""
+"""Algorithms: how rows of experience become better weights, one file for each algorithm.
+
+Begin with ``ppo``. Settings of all are in ``config``, what they get in ``batches``, what they share
+in ``base`` and ``off_policy``.
+"""
 
 from typing import TYPE_CHECKING
 
-from skillweave.public import lazy
+from skillweave._internal.public import lazy
 
 if TYPE_CHECKING:
     from skillweave.algorithms.base import (
@@ -10,10 +14,10 @@ if TYPE_CHECKING:
         AgentState as AgentState,
         Algorithm as Algorithm,
     )
+    from skillweave.algorithms.batches import Report as Report, Rollout as Rollout, Sample as Sample
     from skillweave.algorithms.config import OnPolicy as OnPolicy
     from skillweave.algorithms.parameters import ParameterGroup as ParameterGroup
     from skillweave.algorithms.registry import register_algorithm as register_algorithm
-    from skillweave.experience import Report as Report, Rollout as Rollout, Sample as Sample
     from skillweave.networks.encoders import (
         Encoder as Encoder,
         register_encoder as register_encoder,

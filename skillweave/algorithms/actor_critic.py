@@ -9,17 +9,17 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams
+from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm, OffPolicyState
 from skillweave.algorithms.parameters import ParameterGroup
-from skillweave.experience import Sample
 from skillweave.networks.config import Network
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.losses import critic_loss
 from skillweave.ops.optim import adam_, clip_grad_norm_
-from skillweave.seeding import Seeds
 from skillweave.spaces import ObsCodec
 
 

@@ -10,17 +10,17 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Report
 from skillweave.algorithms.config import check_spaces
 from skillweave.algorithms.parameters import ParameterGroup, member_setting
 from skillweave.algorithms.schedules import is_schedule
 from skillweave.errors import DeclarationError
-from skillweave.experience import Report
 from skillweave.networks.heads import ActionHead, JointHead
 from skillweave.networks.stacked import Inputs, Layout
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import CLIP, merge_moments, scale_of
 from skillweave.ops.threads import torch_threads
-from skillweave.seeding import Seeds
 from skillweave.spaces import (
     ActionCodec,
     ChoiceSpace,

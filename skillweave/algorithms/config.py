@@ -12,10 +12,10 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import gymnasium as gym
 
+from skillweave._internal.messages import suggest
+from skillweave._internal.named import Named
 from skillweave.algorithms.schedules import LearningRate, check_rate
 from skillweave.errors import DeclarationError, EnvError, RunError
-from skillweave.messages import suggest
-from skillweave.named import Named
 from skillweave.networks.config import Network, check_critic
 from skillweave.policies.files import shown
 from skillweave.schema import (

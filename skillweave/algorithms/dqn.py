@@ -13,11 +13,12 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams, Device
+from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.config import DQN
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm, OffPolicyState, normal
 from skillweave.algorithms.parameters import ParameterGroup
-from skillweave.experience import Sample
 from skillweave.networks.qnet import QNet
 from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.device import FLOAT, Constant
@@ -25,7 +26,6 @@ from skillweave.ops.distributions import mask_logits
 from skillweave.ops.losses import categorical_projection, td_loss, weighted_mean
 from skillweave.ops.moments import scale_of
 from skillweave.ops.returns import td_target
-from skillweave.seeding import Seeds
 
 WIDEST = 10.0
 """Largest return on atoms without v_min and v_max, in units of the returns seen so far."""

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import AgentState, Algorithm
+from skillweave.algorithms.batches import Report, Sample
 from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.parameters import rate_now
-from skillweave.experience import Report, Sample
 from skillweave.networks.stacked import Views
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.distributions import mask_logits

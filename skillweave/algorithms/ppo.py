@@ -16,13 +16,14 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Device
+from skillweave.algorithms.batches import Reference, Rehearsal, Report, Rollout
 from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.parameters import ParameterGroup, epsilon_now, rate_now
 from skillweave.algorithms.rollouts import Cells, Samples, minibatches, values_after
 from skillweave.errors import DeclarationError
-from skillweave.experience import Reference, Rehearsal, Report, Rollout
 from skillweave.networks.heads import ChoiceHead, head_of
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, Views, take_rows
@@ -31,7 +32,6 @@ from skillweave.ops.losses import approximate_kl, likelihood_ratio, ppo_policy_l
 from skillweave.ops.moments import explained_variance, masked_mean, normalize
 from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
 from skillweave.ops.returns import gae
-from skillweave.seeding import Seeds
 from skillweave.spaces import ChoiceSpace
 from skillweave.types import Array
 

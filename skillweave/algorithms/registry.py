@@ -6,6 +6,7 @@ import importlib
 from dataclasses import is_dataclass
 from typing import Any, cast
 
+from skillweave._internal.arguments import checked_names
 from skillweave.algorithms.base import REQUIRED, Algorithm
 from skillweave.algorithms.config import (
     BUILT_IN,
@@ -16,7 +17,6 @@ from skillweave.algorithms.config import (
     add_registration,
     registration_of,
 )
-from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
 
 _SETTINGS: dict[str, type[Any]] = {"rollout": OnPolicy, "replay": OffPolicy}

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skillweave.experience import Rollout
+from skillweave.algorithms.batches import Rollout
 from skillweave.networks.stacked import Inputs, take_rows
 from skillweave.ops.device import on_host
 

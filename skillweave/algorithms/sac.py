@@ -16,11 +16,12 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.actor_critic import ActorCriticAlgorithm, ActorCriticState, Critics
 from skillweave.algorithms.base import ActingParams
+from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.off_policy import normal
-from skillweave.experience import Sample
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, Views
@@ -35,7 +36,6 @@ from skillweave.ops.losses import expected_soft_value, masked_entropy_target
 from skillweave.ops.optim import adam_
 from skillweave.ops.returns import discounted, td_target
 from skillweave.schema import check
-from skillweave.seeding import Seeds
 
 
 @dataclass

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, Any
 
+from skillweave._internal.messages import error_text, short
+from skillweave._internal.named import Named, known_names, named
 from skillweave.errors import DeclarationError
-from skillweave.messages import error_text, short
-from skillweave.named import Named, known_names, named
 from skillweave.schema import (
     LARGEST_FLOAT,
     RECORDED,

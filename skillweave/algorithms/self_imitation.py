@@ -15,16 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Report, Rollout
 from skillweave.algorithms.config import SelfImitationPPO
 from skillweave.algorithms.ppo import PPOAlgorithm, State as PPOState, Terms
 from skillweave.algorithms.rollouts import Cells, first_true
 from skillweave.errors import RunError
-from skillweave.experience import Report, Rollout
 from skillweave.networks.stacked import Views, take_rows
 from skillweave.ops.device import BOOL, FLOAT, all_false
 from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.ops.returns import gae
-from skillweave.seeding import Seeds
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
 
 

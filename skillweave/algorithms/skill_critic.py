@@ -20,11 +20,12 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Device
+from skillweave.algorithms.batches import Report, Rollout
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.parameters import ParameterGroup, epsilon_now, rate_now
 from skillweave.algorithms.rollouts import values_after
-from skillweave.experience import Report, Rollout
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, take_rows
 from skillweave.ops.device import FLOAT, Constant
@@ -32,7 +33,6 @@ from skillweave.ops.losses import value_loss
 from skillweave.ops.moments import explained_variance
 from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.ops.returns import gae
-from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
 
 

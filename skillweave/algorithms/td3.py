@@ -14,17 +14,17 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.actor_critic import ActorCriticAlgorithm, ActorCriticState, Critics
 from skillweave.algorithms.base import ActingParams, Device
+from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.config import TD3
 from skillweave.algorithms.off_policy import normal
-from skillweave.experience import Sample
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.distributions import smoothed_action
 from skillweave.ops.returns import td_target
-from skillweave.seeding import Seeds
 
 
 @dataclass

@@ -12,6 +12,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import as_path, short, shown_path
+from skillweave._internal.notices import notice
+from skillweave._internal.paths import AGENT, join, level_of, name_of
+from skillweave._internal.shipped import weights_path
+from skillweave._internal.terminal import printable
 from skillweave.algorithms.config import PPO, AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.api.applying import (
@@ -41,7 +47,6 @@ from skillweave.api.train_options import (
     Takes,
     TrainOptions,
 )
-from skillweave.arguments import checked_names
 from skillweave.envs.make import EngineName, EnvSpec
 from skillweave.errors import DeclarationError, RunError
 from skillweave.export.write import Export, write_export
@@ -59,9 +64,6 @@ from skillweave.hierarchy.weights import (
     write_agent,
     write_weights,
 )
-from skillweave.messages import as_path, short, shown_path
-from skillweave.notices import notice
-from skillweave.paths import AGENT, join, level_of, name_of
 from skillweave.planning import CallLog, Planner
 from skillweave.planning.forecast import Forecast, forecast
 from skillweave.planning.record import with_returns
@@ -76,12 +78,10 @@ from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.runs.manifest import LevelEntry, manifest_in
 from skillweave.runs.trackers import track_film
 from skillweave.schema import AtLeastOne, Count, as_json, fitted
-from skillweave.shipped import weights_path
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.own_part import ZERO, part_from_json
-from skillweave.terminal import printable
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.evaluation_file import load_evaluation, save_evaluation
 from skillweave.training.plain_agent import PlainAgent

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TypeVar
 
 from skillweave.algorithms.policy import AgentHeader
-from skillweave.collecting.user_code import environment_texts, notice_changes
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
 from skillweave.hierarchy import training
@@ -24,6 +23,7 @@ from skillweave.reporting.report.facts import plain, settings
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Manifest, SkillEntry
+from skillweave.runs.user_code import environment_texts, notice_changes
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import other_goals
 from skillweave.spaces import space_from_json

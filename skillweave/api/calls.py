@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from skillweave.collecting.skill_set import SkillSet, skills_below
+from skillweave._internal.messages import shown_path
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
-from skillweave.messages import shown_path
 from skillweave.planning import CallLog
 from skillweave.planning.run_log import (
     RECORD,
@@ -22,6 +21,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.schema import Count, fitted
 from skillweave.skills.base import RecordedSkill
+from skillweave.skills.skill_set import SkillSet, skills_below
 from skillweave.types import Policy
 
 

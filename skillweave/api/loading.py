@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import as_path, short
+from skillweave._internal.shipped import names
 from skillweave.api import Agent, Hierarchy, Run, run_of
 from skillweave.api.applying import load_policy
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.running import begin, begun
 from skillweave.api.train_options import AgentOptions
-from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, RunError
-from skillweave.messages import as_path, short
 from skillweave.runs import hub
 from skillweave.runs.command_words import python_string
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Manifest
 from skillweave.schema import as_json
-from skillweave.shipped import names
 from skillweave.training.plain_agent import Declared
 
 ASK = "Point to the file that defines it, if you trust it: --recipe FILE.py"

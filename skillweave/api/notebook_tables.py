@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from skillweave._internal.notebooks import Markup, facts, joined, paragraph, table
+from skillweave._internal.terminal import printable
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.roles import Roles, roles_of
 from skillweave.hierarchy.schedule import budgets_of
-from skillweave.notebooks import Markup, facts, joined, paragraph, table
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills.base import RecordedSkill, about, own_methods
-from skillweave.terminal import printable
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.training.plain_agent import PlainAgent
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.api import Hierarchy, Run, TrainedPolicy
-from skillweave.arguments import checked_names
 from skillweave.envs.make import make_engine
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.fitting import ready_policies
@@ -11,7 +12,6 @@ from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import roles_of
 from skillweave.schema import AtLeastOne, Share, fitted
-from skillweave.seeding import Seeds, global_generators
 
 
 @checked_names

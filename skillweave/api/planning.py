@@ -10,25 +10,25 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from skillweave._internal.messages import short
+from skillweave._internal.paths import SELECTOR
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import PPO
 from skillweave.api.task_views import OwnSelector, own_skills
-from skillweave.collecting.calls import as_logits
-from skillweave.collecting.skill_set import skills_below
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
+from skillweave.experience.calls import as_logits
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.settings import Guide, Selection
-from skillweave.messages import short
-from skillweave.paths import SELECTOR
 from skillweave.planning import Planner, successes
 from skillweave.planning.calls import seen_places
-from skillweave.planning.mission_text import RESERVED
+from skillweave.planning.mission import RESERVED
 from skillweave.planning.neighbors import FEATURES
 from skillweave.planning.predicates import WORD
 from skillweave.planning.task_env import OwnView, Tasked
 from skillweave.runs.initial_policies import Learnt
-from skillweave.seeding import Seeds
+from skillweave.skills.skill_set import skills_below
 from skillweave.spaces import obs_codec
 from skillweave.training.imitation import imitate
 from skillweave.types import Policy

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from skillweave.arguments import checked_names
-from skillweave.collecting.skill_set import in_place
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.policy import SkillAlone
-from skillweave.messages import short
 from skillweave.policies.actor import ROW, Actor, Deployed
 from skillweave.policies.spaces import space_of
+from skillweave.skills.skill_set import in_place
 from skillweave.spaces import obs_dtype
 from skillweave.types import Array, Policy
 

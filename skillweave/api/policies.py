@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import schema
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import as_path, short
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.export.read import read_policy
 from skillweave.export.write import Export, write_export
-from skillweave.messages import as_path, short
 from skillweave.policies.codec import MANIFEST
 from skillweave.runs import hub
 from skillweave.skills.foreign_policy import Foreign, fitted

@@ -11,13 +11,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
+from skillweave._internal.messages import error_text, suggest
+from skillweave._internal.shipped import FOLDER, file_of, names
+from skillweave._internal.tracebacks import place
 from skillweave.api.running import READING
-from skillweave.collecting.shipping import add_folder
 from skillweave.errors import DeclarationError, SkillweaveError, reworded
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.messages import error_text, suggest
-from skillweave.shipped import FOLDER, file_of, names
-from skillweave.tracebacks import place
+from skillweave.workers.shipping import add_folder
 
 H = TypeVar("H", bound=Declaration)
 

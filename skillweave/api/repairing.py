@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from skillweave._internal.messages import as_path, short, shown_path
+from skillweave._internal.paths import join, level_of, name_of
 from skillweave.algorithms.config import OnPolicy, config_to_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.applying import Trained, apply_manifest
@@ -26,8 +28,6 @@ from skillweave.hierarchy.repair import (
     rehearsed_obs,
 )
 from skillweave.hierarchy.roles import Roles, roles_of
-from skillweave.messages import as_path, short, shown_path
-from skillweave.paths import join, level_of, name_of
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Manifest, RepairEntry, StageEntry

@@ -11,24 +11,23 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from skillweave._internal.messages import absolute, as_path, shown_path
+from skillweave._internal.notices import collected_notices, warn
+from skillweave._internal.paths import AGENT
+from skillweave._internal.seeding import Seeds, global_generators
+from skillweave._internal.terminal import steady_streams
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.api.applying import D, Trained, apply_manifest, differences
 from skillweave.api.continuing import prepared, to_continue
 from skillweave.api.starting import starts
 from skillweave.api.train_options import AgentOptions, Going, ResumeOptions, TrainOptions
-from skillweave.collecting.cluster import Ray
-from skillweave.collecting.placement import LOCAL, Placement
-from skillweave.collecting.start_methods import runs_again, why_no_processes
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.evolution.plan import Evolve, check_several, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.roles import Level, roles_of
-from skillweave.messages import absolute, as_path, shown_path
-from skillweave.notices import collected_notices, warn
 from skillweave.ops.device import normal_tensors
-from skillweave.paths import AGENT
 from skillweave.planning.recorder import check_size
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import called_by, resume_words, saved_words
@@ -38,12 +37,13 @@ from skillweave.runs.initial_policies import copy_initial_policies
 from skillweave.runs.manifest import Manifest, StageEntry, identity
 from skillweave.runs.numbered import make_numbered
 from skillweave.runs.trackers import Listener, make_trackers
-from skillweave.seeding import Seeds, global_generators
-from skillweave.terminal import steady_streams
 from skillweave.training.callback import TrainCallback
 from skillweave.training.plain_agent import Declared
 from skillweave.training.role import Role, agent_role
 from skillweave.training.stage import assign_workers, check_replay, check_stages, workers_of
+from skillweave.workers.cluster import Ray
+from skillweave.workers.placement import LOCAL, Placement
+from skillweave.workers.start_methods import runs_again, why_no_processes
 
 READING: ContextVar[str | None] = ContextVar("READING", default=None)
 """The Python file that is being read for its declaration; None: none is."""

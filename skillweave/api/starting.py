@@ -9,14 +9,14 @@ from typing import Any, Protocol
 
 import torch
 
+from skillweave._internal.messages import as_path, short, suggest
+from skillweave._internal.notices import notice
+from skillweave._internal.paths import AGENT, decides
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.user_code import changes
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.messages import as_path, short, suggest
-from skillweave.notices import notice
-from skillweave.paths import AGENT, decides
 from skillweave.policies.files import shown
 from skillweave.runs.initial_policies import (
     Chooses,
@@ -27,7 +27,7 @@ from skillweave.runs.initial_policies import (
     same_shapes,
 )
 from skillweave.runs.manifest import Manifest, StageEntry
-from skillweave.seeding import Seeds
+from skillweave.runs.user_code import changes
 from skillweave.skills.goal_spaces import goal_part, other_goals
 from skillweave.skills.learnable import Learnable
 from skillweave.spaces import same_space

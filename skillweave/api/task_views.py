@@ -12,7 +12,6 @@ from typing import Any, Self
 
 import gymnasium as gym
 
-from skillweave.collecting.skill_set import SkillSet, policy_of, selects
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.planning.task_env import OwnView
 from skillweave.policies.core import LastCall
@@ -21,13 +20,13 @@ from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.policies.leaves import Selector
 from skillweave.policies.parts import Viewed
 from skillweave.schema import as_json
-from skillweave.selectors import ReadySelector
-from skillweave.skills import Reflex, Skill
+from skillweave.skills import ReadySelector, Reflex, Skill
 from skillweave.skills.base import own_methods
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.own_part import OwnPart
+from skillweave.skills.skill_set import SkillSet, policy_of, selects
 from skillweave.types import Array, Memory, Policy, Step
 
 

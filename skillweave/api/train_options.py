@@ -15,10 +15,9 @@ from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, get_type_hints
 
 import gymnasium as gym
 
+from skillweave._internal.arguments import checked_names
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.api.starting import StartFrom
-from skillweave.arguments import checked_names
-from skillweave.collecting.cluster import Ray
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.evolution.plan import Evolve
@@ -26,6 +25,7 @@ from skillweave.runs.manifest import Manifest
 from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.training.callback import Callback, check_callback
 from skillweave.training.options import CallReports, Continuing, Reports, Starting
+from skillweave.workers.cluster import Ray
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import DTypeLike
 from torch import Tensor
 
+from skillweave.algorithms.batches import Batch, Sample
 from skillweave.buffers.priorities import Priorities
 from skillweave.buffers.replay_storage import NOTHING, TERMINATED, Columns, copy_into
 from skillweave.errors import TrainingError
-from skillweave.experience import Batch, Sample
 from skillweave.spaces import ActionCodec, to_tensor
 from skillweave.types import Array
 

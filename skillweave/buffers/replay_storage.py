@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import DTypeLike
 from torch import Tensor
 
+from skillweave.algorithms.batches import Batch
 from skillweave.buffers.held import check_columns
 from skillweave.buffers.ram import check_memory
 from skillweave.errors import DeclarationError, RunError
-from skillweave.experience import Batch
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.algorithms.batches import SCHEMA, Batch, Reference, Rollout, column
 from skillweave.buffers.held import ONE_ROW, check_held
-from skillweave.experience import SCHEMA, Batch, Reference, Rollout, column
 from skillweave.spaces import ActionCodec, to_tensor
 from skillweave.types import Array, unprefixed
 

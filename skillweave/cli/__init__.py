@@ -1,4 +1,7 @@
-"""The command line: parse, call, print."""
+"""The command line: parse, call, print.
+
+Begin with ``commands``, which lists commands and their options; ``execute`` carries them out.
+"""
 
 from skillweave.cli.main import main
 

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import recipes
+from skillweave._internal.messages import shown_path
 from skillweave.api import Hierarchy, Run
 from skillweave.cli import commands
 from skillweave.cli.output import print_line, print_result, save_score
 from skillweave.errors import MissingExtra, RunError
-from skillweave.messages import shown_path
 from skillweave.recipes import lander_missions as missions
 from skillweave.training.evaluation import Evaluation
 

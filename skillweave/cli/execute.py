@@ -11,6 +11,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from skillweave import recipes
+from skillweave._internal.notices import notice
+from skillweave._internal.terminal import one_line, say
 from skillweave.api import Agent, Hierarchy, Run
 from skillweave.api.hub import pull_run, push_run
 from skillweave.api.loading import ASK, declared_in, load_from
@@ -25,7 +27,6 @@ from skillweave.compat.agilerl_files import convert
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy.recorded import calls_of
 from skillweave.hierarchy.weights import HierarchyHeader, open_weights
-from skillweave.notices import notice
 from skillweave.planning import Explorer, Handover, as_task
 from skillweave.planning.run_log import handover_json, handover_of
 from skillweave.reporting.curves_figure import plot_curves
@@ -37,7 +38,6 @@ from skillweave.runs.hub import check_name, hub
 from skillweave.runs.manifest import Manifest
 from skillweave.runs.several import open_runs
 from skillweave.schema import as_json
-from skillweave.terminal import one_line, say
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 
 

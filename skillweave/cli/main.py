@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
-from skillweave.terminal import end_quietly, put_result, say, steady_streams
+from skillweave._internal.terminal import end_quietly, put_result, say, steady_streams
 
 ADDRESS = re.compile(r"auto|local|(ray://)?[^\s/-][^\s/]*:\S*")
 """What may follow ``--ray``."""
@@ -54,9 +54,9 @@ def _main(arguments: Sequence[str] | None) -> int:
         "skillweave --version prints the version.",
         args=tyro_arguments,
     )
+    from skillweave._internal.tracebacks import all_frames_wanted
     from skillweave.errors import SkillweaveError
     from skillweave.runs.command_words import called_by
-    from skillweave.tracebacks import all_frames_wanted
 
     try:
         from skillweave.cli import execute
@@ -75,7 +75,7 @@ def _unknown_command(words: Sequence[str], known: Sequence[str]) -> str:
     """Return a sentence about a first word that is no command; empty if it is one, or none."""
     if not words or words[0] in known or words[0].startswith("-"):
         return ""
-    from skillweave.messages import suggest
+    from skillweave._internal.messages import suggest
 
     return f"no command {words[0]!r}{suggest(words[0], known)} (skillweave --help)"
 

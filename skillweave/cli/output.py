@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from skillweave._internal.messages import shown_path
+from skillweave._internal.terminal import put_result, say
 from skillweave.api import Run
 from skillweave.cli import commands
 from skillweave.errors import RunError
-from skillweave.messages import shown_path
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
-from skillweave.terminal import put_result, say
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation
 

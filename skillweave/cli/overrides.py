@@ -9,16 +9,16 @@ from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
+from skillweave._internal.messages import suggest
 from skillweave.algorithms.config import AlgorithmConfig, named_config
 from skillweave.algorithms.schedules import Linear
 from skillweave.api.running import apart_to_evolve
-from skillweave.collecting.lengths import Lengths
 from skillweave.errors import DeclarationError
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.messages import suggest
 from skillweave.schema import annotations_of, described, flat, options_of
 from skillweave.skills import Skill, is_trained
+from skillweave.skills.lengths import Lengths
 
 PLAIN = ("call_steps", "steps", "learn")
 """Fields of a hierarchy that are set by themselves."""

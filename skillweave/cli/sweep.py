@@ -1,43 +1,51 @@
 """``sweep``: many runs of a recipe, here in processes or on Ray, and a table of their results.
 
 Each run is an ordinary run directory. A sweep that was stopped, or one of its runs, continues when
-the same command is given again.
+the same command is given again, with the same code.
 """
 
 from __future__ import annotations
 
+import ast
+import hashlib
 import itertools
+import json
 import platform
 import re
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
+from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from importlib import metadata
+from importlib.util import resolve_name
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, TypedDict
 
 import numpy as np
 
 from skillweave import recipes
+from skillweave._internal.messages import error_text, short
+from skillweave._internal.terminal import say
 from skillweave.api import Hierarchy
 from skillweave.api.loading import finish
 from skillweave.api.running import begun
 from skillweave.cli import commands
 from skillweave.cli.overrides import apply_overrides
 from skillweave.cli.processes import ProcessEnded, processes
-from skillweave.cli.sweep_code import MARK, must_be_same_code
-from skillweave.collecting.cluster import Ray
-from skillweave.collecting.shipping import packed, unpacked
 from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy import training
-from skillweave.messages import error_text, short
+from skillweave.policies.files import shown
 from skillweave.reporting.report.groups import over_seeds
+from skillweave.runs.files import read_json, write_json
 from skillweave.runs.manifest import Manifest
-from skillweave.schema import AtLeastOne, fitted
-from skillweave.terminal import say
+from skillweave.schema import AtLeastOne, fit, fitted
 from skillweave.training.evaluation_file import load_evaluation
+from skillweave.workers.cluster import Ray
+from skillweave.workers.shipping import is_own_code, packed, unpacked
 
 MOST = 10_000
 """Runs of a sweep."""
@@ -216,7 +224,7 @@ def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float 
     """Do each run as a task of Ray; one whose machine is lost continues on another."""
     cluster = Ray(address=command.ray or None)
     with cluster.joined(command.jobs or cores()) as ray:
-        from skillweave.collecting.actors import LOST, check_versions
+        from skillweave.workers.actors import LOST, check_versions
 
         kind = ray.remote(num_cpus=1, max_retries=RETRIES, max_calls=1)(_task())
         good = [(metadata.version("skillweave"), platform.python_version())]
@@ -250,7 +258,7 @@ def _task() -> Callable[..., Any]:
     It returns the node's versions where they do not fit, else None; and the run's result. It is
     sent to the nodes as code, so that it can report a node without Skillweave.
     """
-    from skillweave.collecting.actor_host import actor_class
+    from skillweave.workers.actor_host import actor_class
 
     place = actor_class()()
 
@@ -310,3 +318,89 @@ def _table(groups: Sequence[dict[str, Any]]) -> list[str]:
 
 def _failures(failed: Sequence[dict[str, str]]) -> list[str]:
     return [f"failed  {f['run']}: {f['error']}" for f in failed]
+
+
+MARK = ".sweep"
+"""A file in the sweep's directory; a machine that can read it shares the directory."""
+
+
+class Mark(TypedDict):
+    """Content of the file."""
+
+    recipe: str
+    """The recipe, as the user named it."""
+    code: str
+    """A checksum of its code."""
+
+
+def must_be_same_code(out: Path, recipe: str) -> None:
+    """Write the checksum of the recipe's code into a sweep's directory, or compare with it.
+
+    The recipe must be loaded, so that the modules that it imports are known. It may be mended where
+    no run has learnt yet, for example where it failed at its first step.
+
+    Raises:
+        RunError: the runs there are trained by other code; or the directory cannot be
+            written.
+    """
+    file = out / MARK
+    code = _checksum(code_files(recipes.file_of(recipe)))
+    learnt = any(out.glob("*/checkpoint*")) or any(out.glob("*/policies/*"))
+    if not learnt or not file.exists():
+        write_json(file, Mark(recipe=recipe, code=code), make_directories=False)
+        return
+    mark: Mark = fit(Mark, read_json(file), str(file))
+    if mark["code"] != code:
+        raise RunError(
+            f"{out} holds runs of the recipe {shown(mark['recipe'], 500)}, which were not trained "
+            f"by the code of {recipe} as it is now: it is another recipe, or it was edited since, "
+            "or a module of yours that it imports was. One table would mix both. Choose another "
+            f"directory (--out), or delete {out}. If what was edited cannot change results, as a "
+            f"comment cannot, delete {file} alone"
+        )
+
+
+def code_files(recipe: Path) -> dict[str, Path]:
+    """Return a recipe's file, and by their names the user's modules that it imports.
+
+    Of a shipped recipe these are its parts.
+    """
+    files = {"": recipe}
+    due = [(recipe, "")]
+    while due:
+        file, package = due.pop()
+        if file.suffix != ".py":  # compiled
+            continue
+        for name in _imported(file.read_bytes(), package):
+            module = sys.modules.get(name)
+            if module is None or name in files or not _is_part(module):
+                continue
+            files[name] = Path(str(module.__file__))
+            due.append((files[name], module.__package__ or ""))
+    return files
+
+
+def _checksum(files: Mapping[str, Path]) -> str:
+    """Return a checksum of the names of modules and the contents of their files."""
+    sums = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
+    return hashlib.sha256(json.dumps(sums, sort_keys=True).encode()).hexdigest()
+
+
+def _is_part(module: ModuleType) -> bool:
+    return is_own_code(module) or module.__name__.startswith("skillweave.recipes._")
+
+
+def _imported(source: bytes, package: str) -> Iterator[str]:
+    """Yield the modules that a file of a package names, and the packages that they are in."""
+    for node in ast.walk(ast.parse(source)):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = "." * node.level + (node.module or "")
+            with suppress(ImportError):  # `from . import x` in a file that is in no package
+                base = resolve_name(base, package)
+                names = [f"{base}.{alias.name}" for alias in node.names]
+        for name in names:
+            parts = name.split(".")
+            yield from (".".join(parts[: i + 1]) for i in range(len(parts)))

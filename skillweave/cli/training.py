@@ -8,18 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import recipes
+from skillweave._internal.messages import shown_path
 from skillweave.api import Hierarchy, Run
 from skillweave.api.loading import declared_by
 from skillweave.cli import commands
 from skillweave.cli.output import print_line, print_result, run_words, save_score
 from skillweave.cli.overrides import apply_overrides, parse_evolve
-from skillweave.collecting.cluster import Ray
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.config import Evolution
-from skillweave.messages import shown_path
 from skillweave.runs.directory import RunDirectory
 from skillweave.schema import Count, as_json, fitted
 from skillweave.training.options import Continuing, Starting
+from skillweave.workers.cluster import Ray
 
 
 def train(command: commands.Train) -> None:

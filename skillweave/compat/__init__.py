@@ -1,1 +1,4 @@
-"""Other libraries' names for what Skillweave does, so that their scripts run; thin."""
+"""Names and files of AgileRL on Skillweave's algorithms, so that its scripts run.
+
+Begin with ``agilerl/agents``; ``agilerl_files`` converts checkpoints.
+"""

@@ -14,16 +14,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import DQN, PPO, TD3
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.compat.agent_files import save_agent
 from skillweave.compat.pickles import read_torch_pickle
+from skillweave.compat.single_agent import save_agent
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.stacked import Views
 from skillweave.policies.files import shown
 from skillweave.schema import AtLeastOne, Check, fit
-from skillweave.seeding import Seeds
 
 _KINDS: dict[str, Any] = {"PPO": PPO, "DQN": DQN, "DDPG": TD3, "TD3": TD3}
 _OUTPUTS = {"PPO": "Softmax", "DQN": None, "DDPG": "Tanh", "TD3": "Tanh"}

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.batches import Rollout, Sample
 from skillweave.algorithms.ppo import PPOAlgorithm, State
-from skillweave.experience import Rollout, Sample
 from skillweave.networks.heads import ActionHead
 
 

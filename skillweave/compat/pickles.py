@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.messages import short, shortened
 from skillweave.errors import RunError, SkillweaveError
-from skillweave.messages import short, shortened
 from skillweave.policies.files import check_file, shown
 
 DEEPEST = 100

@@ -8,8 +8,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from skillweave.algorithms.batches import Batch, Sample
 from skillweave.buffers.replay import ReplayStore
-from skillweave.experience import Batch, Sample
 from skillweave.ops.device import FLOAT
 from skillweave.types import Array
 

@@ -6,9 +6,9 @@ import os
 import sys
 from typing import Any
 
+from skillweave._internal.terminal import say
 from skillweave.errors import needs_extra
 from skillweave.runs.trackers import wandb_mode
-from skillweave.terminal import say
 
 _messages: list[str] = []
 """What has not been printed yet."""

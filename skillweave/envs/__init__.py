@@ -1,8 +1,11 @@
-"""Environments: engines with one meaning of resets, and checks of environments."""
+"""Environments, many at once: engines that step and reset them, and checks of what they answer.
+
+Begin with ``engine``; ``make`` declares an environment and chooses its engine.
+"""
 
 from typing import TYPE_CHECKING
 
-from skillweave.public import lazy
+from skillweave._internal.public import lazy
 
 if TYPE_CHECKING:
     from skillweave.envs.pool import PoolWrapper as PoolWrapper, one_of as one_of

@@ -16,12 +16,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave._internal.messages import error_text, short
+from skillweave._internal.notices import notice
 from skillweave.envs.image_bounds import ImageBounds
 from skillweave.envs.infos import MASK, observes_mask
 from skillweave.envs.pool import first_row
 from skillweave.errors import EnvError, SkillweaveError
-from skillweave.messages import error_text, short
-from skillweave.notices import notice
 from skillweave.policies.spaces import space_of
 from skillweave.spaces import choice_counts, obs_shape
 from skillweave.spaces.packing import parts

@@ -22,13 +22,13 @@ from typing import Any, Protocol
 import gymnasium as gym
 import numpy as np
 
+from skillweave._internal.notices import are_collected, notice
+from skillweave._internal.seeding import GlobalDraws, Seeds, global_generators
 from skillweave.envs.checks import Watch, time_limit
 from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks, allowed_rows, random_actions
 from skillweave.errors import EnvError, SkillweaveError, reworded
-from skillweave.notices import are_collected, notice
 from skillweave.policies.infos import batched_infos
-from skillweave.seeding import GlobalDraws, Seeds, global_generators
 from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
 from skillweave.spaces.packing import parts
 from skillweave.types import Array, Step

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.notices import notice
+from skillweave._internal.notices import notice
 from skillweave.spaces.observations import image_layout
 from skillweave.spaces.packing import parts
 from skillweave.types import Array

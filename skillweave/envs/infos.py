@@ -8,8 +8,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave._internal.messages import short
 from skillweave.errors import EnvError
-from skillweave.messages import short
 from skillweave.policies.core import OWN_REWARD, SUCCESS
 from skillweave.policies.infos import NUMBERS, batched_infos
 from skillweave.policies.spaces import allows_each

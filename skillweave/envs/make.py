@@ -14,7 +14,9 @@ import gymnasium as gym
 import numpy as np
 
 import skillweave.toys  # registers their ids  # noqa: F401
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import error_text, short, shortened, suggest
+from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.envs.checks import CheckedEnv, is_batched, refuse_batched
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
@@ -22,10 +24,8 @@ from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.obs_names import Names, ObsNames, names_in
 from skillweave.envs.pool import MakePool, envpool, takes_ids
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError
-from skillweave.messages import error_text, short, shortened, suggest
 from skillweave.policies.infos import batched_infos
 from skillweave.schema import AtLeastOne, Check, check_fields, to_json
-from skillweave.seeding import Seeds, global_generators
 from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
 from skillweave.spaces.packing import parts
 
@@ -111,6 +111,7 @@ class EnvSpec:
     # These do not make a different environment.
     obs_names: Names | None = field(default=None, compare=False, repr=False)
     check_seed: bool = field(default=True, compare=False, repr=False)
+    _spaces: Spaces | None = field(default=None, init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if is_batched(self.env):
@@ -120,8 +121,7 @@ class EnvSpec:
     @property
     def spaces(self) -> Spaces:
         """Return the environment's spaces; the first time, make one to read them."""
-        known: Spaces | None = vars(self).get("_spaces")
-        return self.read_spaces() if known is None else known
+        return self._spaces or self.read_spaces()
 
     @global_generators(Seeds(0) / "spaces")
     def read_spaces(self) -> Spaces:
@@ -136,7 +136,7 @@ class EnvSpec:
         return spaces
 
     def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in vars(self).items() if k != "_spaces"}
+        return vars(self) | {"_spaces": None}
 
     def make(self, render_mode: str | None = None, number: int | None = None) -> CheckedEnv:
         """Make one environment, whose errors name it and its ``number``.

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 import gymnasium as gym
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short, suggest
 from skillweave.errors import DeclarationError, EnvError, needs_extra
-from skillweave.messages import short, suggest
 from skillweave.spaces import pack, unpack
 from skillweave.types import Array
 

@@ -1,8 +1,11 @@
-"""Evolution: a population that learns in stacks, is compared, selected and mutated."""
+"""Evolution: a population that learns in stacks, is compared, selected and mutated.
+
+Begin with ``population``, a generation from start to end; ``stage`` trains one in a run.
+"""
 
 from typing import TYPE_CHECKING
 
-from skillweave.public import lazy
+from skillweave._internal.public import lazy
 
 if TYPE_CHECKING:
     from skillweave.evolution.config import (

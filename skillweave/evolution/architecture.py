@@ -7,6 +7,7 @@ A change is drawn for the settings' networks (``network`` and, if it has one, ``
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,18 +16,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.named import Named
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.errors import DeclarationError
-from skillweave.evolution import growth
 from skillweave.evolution.config import Mutations
 from skillweave.evolution.stacks import Member, copy, even_count, networks_of, spread_count
-from skillweave.named import Named
-from skillweave.networks.config import CNN, Network
+from skillweave.networks.config import CNN, Activation, Network
 from skillweave.networks.encoders import ImageEncoder
 from skillweave.networks.stacked import Views
-from skillweave.networks.units import Units, channels_of, hidden_units, joint_of
+from skillweave.networks.units import Joint, Units, channels_of, hidden_units, joint_of
+from skillweave.ops.device import FLOAT
 
 Alter = Callable[[Views, bool], dict[str, Tensor]]
 """A function from parameters by name, and whether they are moments, to changed parameters."""
@@ -126,8 +127,8 @@ def _fits(config: AlgorithmConfig, by: int, mutations: Mutations) -> bool:
         return len(network.hidden) > fewest and behind > 1
     if behind < 1 or len(network.hidden) >= mutations.layers[1]:
         return False
-    widest = network.hidden[behind - 1] * (1 + (network.activation in growth.PAIRED))
-    able = all(n.activation in growth.IDENTITY for n in networks_of(config).values())
+    widest = network.hidden[behind - 1] * (1 + (network.activation in PAIRED))
+    able = all(n.activation in IDENTITY for n in networks_of(config).values())
     return able and widest <= mutations.units[1]
 
 
@@ -154,7 +155,7 @@ def changed(network: Network, change: Change, cnn: CNN | None, dueling: bool) ->
         layer = min(change.layer, len(hidden) - 1)
         hidden[layer] = max(1, hidden[layer] + change.by)
     elif change.by > 0:
-        hidden.insert(behind, hidden[behind - 1] * (1 + (network.activation in growth.PAIRED)))
+        hidden.insert(behind, hidden[behind - 1] * (1 + (network.activation in PAIRED)))
     elif behind > 1:
         del hidden[behind - 1]
     return replace(network, hidden=tuple(hidden))
@@ -206,8 +207,8 @@ def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:
         joint = joint_of(net)
         activation = net.network.activation
         if change.by > 0:
-            return [lambda _: lambda v, m: growth.deepened(v, joint, activation, moments=m)]
-        return [lambda _: lambda v, m: growth.shallower(v, joint, moments=m)] * (joint.depth > 1)
+            return [lambda _: lambda v, m: deepened(v, joint, activation, moments=m)]
+        return [lambda _: lambda v, m: shallower(v, joint, moments=m)] * (joint.depth > 1)
     if change.kind == "kernel":
         return [
             functools.partial(_resized_kernel, f"{prefix}.{change.layer}.weight", change.by)
@@ -222,11 +223,163 @@ def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:
 def _resized(units: Units, by: int, generator: torch.Generator, online: Views) -> Alter:
     """Return a change of the number of units, the same for all parameters of a family."""
     if by > 0:
-        new = growth.fresh(online, units, by, generator)
-        return lambda v, moments: growth.widened(v, units, by, None if moments else new)
-    units_to_keep = growth.most_read(online, units, max(1, units.count + by))
-    return lambda v, moments: growth.narrowed(v, units, units_to_keep)
+        new = fresh(online, units, by, generator)
+        return lambda v, moments: widened(v, units, by, None if moments else new)
+    units_to_keep = most_read(online, units, max(1, units.count + by))
+    return lambda v, moments: narrowed(v, units, units_to_keep)
 
 
 def _resized_kernel(name: str, by: int, online: Views) -> Alter:
-    return lambda v, moments: growth.with_kernel(v, name, by)
+    return lambda v, moments: with_kernel(v, name, by)
+
+
+IDENTITY: tuple[Activation, ...] = ("relu", "elu", "silu", "gelu")
+"""Activations through which a new layer can compute the identity; through tanh it cannot."""
+PAIRED: tuple[Activation, ...] = ("silu", "gelu")
+"""For these ``f(x) − f(−x) = x``: the new layer has two units for each of the layer before."""
+
+
+def fresh(named: Views, units: Units, extra: int, generator: torch.Generator) -> dict[str, Tensor]:
+    """Draw parameters of ``extra`` new units, by name: He-normal weights, biases zero.
+
+    The deviations of noisy weights are the mean of the existing ones.
+    """
+    parameters = {}
+    for part in units.own:
+        old = named[part.name]
+        shape = list(old.shape)
+        shape[part.axis] = extra * part.block
+        new = torch.zeros(shape, **FLOAT)
+        if part.name.endswith("weight"):
+            inputs = shape[-2] if part.axis == -1 else math.prod(shape[-3:])
+            new = torch.randn(shape, generator=generator, **FLOAT) * (2.0 / inputs) ** 0.5
+        elif part.name.endswith("_sigma"):
+            new = new + old.mean()
+        parameters[part.name] = new
+    return parameters
+
+
+def widened(named: Views, units: Units, extra: int, new: Views | None) -> dict[str, Tensor]:
+    """Add ``extra`` units with outgoing weights of zero; ``new`` None: zeros, for moments."""
+    grown = dict(named)
+    for part in (*units.own, *units.onward):
+        old = grown[part.name]
+        shape = list(old.shape)
+        shape[part.axis] = extra * part.block
+        added = new[part.name] if new is not None and part in units.own else old.new_zeros(shape)
+        end = part.start + units.count * part.block
+        before, after = old.tensor_split([end], dim=part.axis)
+        grown[part.name] = torch.cat([before, added, after], dim=part.axis)
+    return grown
+
+
+def most_read(named: Views, units: Units, count: int) -> Tensor:
+    """Return the ``count`` units with the largest outgoing weights, (R, count), in order."""
+    total: Tensor | None = None
+    for part in units.onward:
+        weight = named[part.name].abs().movedim(part.axis, 1)
+        span = units.count * part.block
+        weight = weight[:, part.start : part.start + span].flatten(2).sum(2)
+        each = weight.view(len(weight), units.count, part.block).sum(2)
+        total = each if total is None else total + each
+    assert total is not None
+    return total.topk(count, dim=1).indices.sort(dim=1).values
+
+
+def narrowed(named: Views, units: Units, units_to_keep: Tensor) -> dict[str, Tensor]:
+    """Keep only the units ``kept`` (R, m)."""
+    cropped = dict(named)
+    rows = len(units_to_keep)
+    for part in (*units.own, *units.onward):
+        old = cropped[part.name]
+        end = part.start + units.count * part.block
+        inner = (
+            part.start
+            + units_to_keep[..., None] * part.block
+            + torch.arange(part.block, device="cpu")
+        )
+        before, after = (
+            torch.arange(*span, device="cpu")
+            for span in ((0, part.start), (end, old.shape[part.axis]))
+        )
+        index = torch.cat(
+            [before.expand(rows, -1), inner.flatten(1), after.expand(rows, -1)], dim=1
+        )
+        shape = [1] * old.ndim
+        shape[0] = rows
+        shape[part.axis] = index.shape[1]
+        cropped[part.name] = torch.take_along_dim(old, index.view(shape), dim=part.axis)
+    return cropped
+
+
+def with_kernel(named: Views, name: str, by: int) -> dict[str, Tensor]:
+    """Add rows and columns of zeros at the end of filters (R, out, in, k, k), or remove some.
+
+    If no layer's output changes its size, larger filters compute the same function.
+    """
+    return {**named, name: torch.nn.functional.pad(named[name], (0, by, 0, by))}
+
+
+def deepened(
+    named: Views, joint: Joint, activation: Activation, *, moments: bool
+) -> dict[str, Tensor]:
+    """Add a hidden layer that is the identity; in moments, new entries are zeros."""
+    paired = activation in PAIRED
+    grown = _renamed(named, joint, 1)
+    readers = [tuple(_moved(n, joint, 1) for n in pair) for pair in joint.readers]
+    width = grown[readers[0][0]].shape[-2]
+    rows = len(grown[readers[0][0]])
+    eye = torch.eye(width, **FLOAT).expand(rows, -1, -1)
+    weight = torch.cat([eye, -eye], dim=-1) if paired else eye
+    bias = torch.full((rows, 1, weight.shape[-1]), float(activation == "elu"), **FLOAT)
+    for kind in joint.kinds:
+        value = weight if kind == "weight" else bias if kind == "bias" else None
+        like = weight if kind.startswith("weight") else bias
+        if value is None or moments:
+            value = torch.zeros_like(like)
+        grown[f"{joint.prefix}.{joint.depth}.{kind}"] = value
+    for name, offset in readers:
+        for sigma in ("", "_sigma") if f"{name}_sigma" in grown else ("",):
+            old = grown[name + sigma]
+            if activation == "elu" and not moments and not sigma:
+                # elu(x + 1) = x + 1 for any output x of an elu; the reader subtracts the 1.
+                grown[offset] = grown[offset] - old.sum(-2, keepdim=True)
+            if paired:
+                other = torch.zeros_like(old) if moments or sigma else -old
+                grown[name + sigma] = torch.cat([old, other], dim=-2)
+    return grown
+
+
+def shallower(named: Views, joint: Joint, *, moments: bool) -> dict[str, Tensor]:
+    """Remove the last hidden layer: its readers read the layer before, through its weights.
+
+    As if the layer were linear; moments become zeros, because the readers are new.
+    """
+    last = f"{joint.prefix}.{joint.depth - 1}"
+    weight, bias = named[f"{last}.weight"], named[f"{last}.bias"]
+    gone = {f"{last}.{kind}" for kind in joint.kinds}
+    rest = {k: v for k, v in named.items() if k not in gone}
+    for name, offset in joint.readers:
+        read = named[name]
+        rest[name] = weight @ read
+        rest[offset] = named[offset] + bias @ read
+        if f"{name}_sigma" in named:
+            sigma = named[f"{name}_sigma"].mean((-2, -1), keepdim=True)
+            rest[f"{name}_sigma"] = sigma.expand_as(rest[name])
+        if moments:
+            for k in (name, offset, f"{name}_sigma", f"{offset}_sigma"):
+                if k in rest:
+                    rest[k] = torch.zeros_like(rest[k])
+    return _renamed(rest, joint, -1)
+
+
+def _renamed(named: Views, joint: Joint, by: int) -> dict[str, Tensor]:
+    return {_moved(k, joint, by): v for k, v in named.items()}
+
+
+def _moved(name: str, joint: Joint, by: int) -> str:
+    """Return a parameter's new name: the head is the layer after the hidden ones."""
+    head = f"{joint.prefix}.{joint.depth}."
+    if not name.startswith(head):
+        return name
+    return f"{joint.prefix}.{joint.depth + by}.{name[len(head) :]}"

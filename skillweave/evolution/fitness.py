@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.collecting.collector import RETURN
-from skillweave.seeding import Seeds
+from skillweave.experience.collector import RETURN
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.periodic import episodes_of
 

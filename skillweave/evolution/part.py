@@ -9,19 +9,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.buffers.replay import ReplayStore
-from skillweave.collecting.acting import Acting
-from skillweave.collecting.collector import Collector, joined_from, parted
-from skillweave.collecting.group import Collectors
 from skillweave.envs.joined import JoinedEngines
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.stacks import Member, grouped, join, split
+from skillweave.experience.acting import Acting
+from skillweave.experience.collector import Collector, joined_from, parted
+from skillweave.experience.group import Collectors
 from skillweave.ops.device import resolve_device
-from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, EpisodeTally, Tick
 from skillweave.training.learner import RolloutLearner, Stack

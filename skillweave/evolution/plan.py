@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 
+from skillweave._internal.messages import short, suggest
 from skillweave.algorithms.config import config_from_json
-from skillweave.collecting.placement import LOCAL, Placement
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.evolution.config import Evolution, evolution_to_json
 from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.part import too_many
 from skillweave.evolution.stage import EvolvingPopulation
-from skillweave.messages import short, suggest
 from skillweave.runs.manifest import StageEntry, Target
 from skillweave.schema import fitted
 from skillweave.training.joint import agents_of
 from skillweave.training.stage_run import MakeLearner, StageLearner, StageRun
+from skillweave.workers.placement import LOCAL, Placement
 
 Evolve = Evolution | Mapping[str, Evolution | None] | None
 """A population for every stage, or for the named ones."""

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.evolution.config import Evolution
@@ -20,7 +21,6 @@ from skillweave.evolution.selection import select
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member, copy, grouped
 from skillweave.runs.manifest import Origin
-from skillweave.seeding import Seeds
 from skillweave.training.learning_task import LearningTask
 from skillweave.types import Array
 

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
 from skillweave.errors import TrainingError
 from skillweave.evolution.config import Evolution, Tournament, Truncation
 from skillweave.types import Array

@@ -16,17 +16,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds, seed_global_generators
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.group import joined_states, split_states
-from skillweave.collecting.placement import MakeWorkers
 from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.part import OnGenerationTick, Part
 from skillweave.evolution.stacks import Member
-from skillweave.seeding import Seeds, seed_global_generators
+from skillweave.experience.group import joined_states, split_states
 from skillweave.training.episodes import EpisodeTally
 from skillweave.training.learning_task import LearningTask
 from skillweave.types import Array
+from skillweave.workers.placement import MakeWorkers
 
 Sent = tuple[int, dict[str, Any], int, dict[str, Array]]
 """A member as a message: number, settings as JSON, steps, tensors of its state."""

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from skillweave._internal import interrupts
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
-from skillweave.collecting import interrupts
-from skillweave.collecting.placement import LOCAL, Placement
 from skillweave.errors import RunError
 from skillweave.evolution.config import Evolution, evolution_from_json
 from skillweave.evolution.fitness import FitnessEnvs
@@ -28,10 +28,10 @@ from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member
 from skillweave.networks.config import Network
 from skillweave.runs.manifest import BestEntry, Generation, LineageLine, MemberEntry, Winner
-from skillweave.seeding import Seeds
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import StageRun
 from skillweave.types import Array, prefixed, unprefixed
+from skillweave.workers.placement import LOCAL, Placement
 
 
 @dataclass

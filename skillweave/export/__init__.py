@@ -1,1 +1,4 @@
-"""A trained policy as ONNX files with its state machine, for machines without this library."""
+"""A trained policy as ONNX files and a ``policy.json``, for machines without this library.
+
+Begin with ``write``, which writes the folder; ``compile`` makes plain data of the policy.
+"""

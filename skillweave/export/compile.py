@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.collecting.skill_set import in_place
 from skillweave.errors import PolicyError
 from skillweave.export.foreign import as_file
 from skillweave.export.graphs import agent_graph, worth_graph
@@ -30,6 +29,7 @@ from skillweave.policies.parts import Corrects, Override, PartOf, Reflexes, View
 from skillweave.policies.planned import Planned
 from skillweave.policies.spaces import Space, space_of
 from skillweave.skills.goals import Goals
+from skillweave.skills.skill_set import in_place
 from skillweave.types import Policy as AnyPolicy
 
 

@@ -11,11 +11,9 @@ from typing import Any, Self
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.lengths import Lengths
-from skillweave.collecting.skill_set import SkillSet, within
+from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.messages import short
 from skillweave.policies.actor import Deployed
 from skillweave.policies.codec import read_folder
 from skillweave.policies.core import Around, Policy, innermost
@@ -30,8 +28,10 @@ from skillweave.skills.base import RecordedSkill
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.goals import Goals
+from skillweave.skills.lengths import Lengths
 from skillweave.skills.mapped import check_range
 from skillweave.skills.mapping import GoalValue, check_in_range
+from skillweave.skills.skill_set import SkillSet, within
 from skillweave.spaces.saving import gym_space
 from skillweave.types import Policy as AnyPolicy
 

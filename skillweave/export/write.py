@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import policies
+from skillweave._internal.terminal import printable
 from skillweave.export.compile import deployed
 from skillweave.policies.codec import FORMAT, MANIFEST, Written
 from skillweave.policies.files import checksum
 from skillweave.runs.files import write_bytes
-from skillweave.terminal import printable
 from skillweave.types import Policy
 
 PACKAGE = "skillweave_policies"

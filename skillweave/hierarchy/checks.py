@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
+from skillweave._internal.messages import short, suggest
+from skillweave._internal.paths import name_of
 from skillweave.algorithms.config import PPO, AlgorithmSettings
-from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.roles import Level, Nestable, Roles
 from skillweave.hierarchy.settings import Guide
-from skillweave.messages import short, suggest
-from skillweave.paths import name_of
 from skillweave.runs.manifest import Target
 from skillweave.schema import fitted
-from skillweave.selectors import Automaton
-from skillweave.skills import Skill, ready_policy
+from skillweave.skills import Automaton, Skill, ready_policy
 from skillweave.skills.learnable import learn_on
+from skillweave.skills.lengths import Lengths
 from skillweave.skills.own_part import ZERO, checked_rest
 from skillweave.training.stage import target_of
 

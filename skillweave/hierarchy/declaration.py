@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short, suggest
+from skillweave._internal.paths import AGENT, CRITIC, SELECTOR, join
 from skillweave.algorithms.config import AlgorithmConfig, AlgorithmSettings
-from skillweave.arguments import checked_names
 from skillweave.envs.make import Spaces
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.checks import (
@@ -20,9 +22,7 @@ from skillweave.hierarchy.fitting import check_settings, ready_policies, ready_s
 from skillweave.hierarchy.roles import Level, Nestable, Roles, hierarchies_of, roles_of
 from skillweave.hierarchy.schedule import DEFAULT_STEPS, budgets_of, stages_of
 from skillweave.hierarchy.settings import Settings, settings_in
-from skillweave.messages import short, suggest
 from skillweave.networks.config import seeing_all
-from skillweave.paths import AGENT, CRITIC, SELECTOR, join
 from skillweave.planning.neighbors import check_features
 from skillweave.planning.predicates import named_predicates
 from skillweave.schema import Positive, check_fields, fitted

@@ -7,23 +7,22 @@ from typing import Any, cast
 
 import gymnasium as gym
 
+from skillweave._internal.paths import join
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
-from skillweave.collecting.skill_set import skills_below
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.networks.config import Network
 from skillweave.networks.net import seen_places
-from skillweave.paths import join
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.policies.spaces import space_of
-from skillweave.selectors import ReadySelector
-from skillweave.skills import ready_policy
+from skillweave.skills import ReadySelector, ready_policy
 from skillweave.skills.foreign_policy import fitted
 from skillweave.skills.goal_spaces import goal_part
 from skillweave.skills.goals import goals_of
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.ready import PART, fitted_to_skill
+from skillweave.skills.skill_set import skills_below
 from skillweave.spaces import obs_codec
 from skillweave.training.checks import check_rollout
 from skillweave.training.role import Role

@@ -9,17 +9,17 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from skillweave.collecting.skill_set import SkillSet, acting_policy, within
+from skillweave._internal.messages import short
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import DeclarationError
-from skillweave.messages import short
 from skillweave.policies.core import RUNNING, Turn, World, restart
 from skillweave.policies.hierarchy import SKILL, unless_none
 from skillweave.policies.parts import GOAL
 from skillweave.policies.spaces import space_of
-from skillweave.seeding import Seeds
+from skillweave.skills.skill_set import SkillSet, acting_policy, within
 from skillweave.spaces import obs_dtype, unpack
 from skillweave.spaces.choices import ChoiceSpace
 from skillweave.types import Array

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
-from skillweave.arguments import checked_names
-from skillweave.collecting.skill_set import SkillSet, acting_alone, acting_policy
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError
-from skillweave.messages import short
 from skillweave.policies.core import Memory as InPlaceMemory, flat, split
 from skillweave.policies.files import checksum
 from skillweave.policies.functional import Functional
@@ -20,6 +19,7 @@ from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import without_goal
 from skillweave.skills.goals import Goals, goals_of
+from skillweave.skills.skill_set import SkillSet, acting_alone, acting_policy
 from skillweave.types import Array, Policy
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from skillweave.collecting.lengths import Lengths
 from skillweave.errors import RunError
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.policies.files import shown
 from skillweave.runs.manifest import GuideEntry, LevelEntry, SkillEntry
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goals import goals_of
+from skillweave.skills.lengths import Lengths
 from skillweave.skills.own_part import part_to_json
 from skillweave.skills.residual import Residual
 from skillweave.spaces import space_to_json

@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.search import NAMED_SHARE, Starts
-from skillweave.collecting.skill_set import SkillSet
+from skillweave._internal.paths import level_of, name_of
 from skillweave.envs.make import EnvSpec
+from skillweave.experience.search import NAMED_SHARE, Starts
 from skillweave.hierarchy.assembly import parts_of, policy_at
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles
-from skillweave.paths import level_of, name_of
 from skillweave.planning import CallLog, Handover, join
 from skillweave.planning.handover import before_each, calls_done, shown_rate
 from skillweave.planning.predicates import Held, as_event
@@ -28,6 +27,7 @@ from skillweave.runs.manifest import Matrix, RepairEntry, StageEntry
 from skillweave.skills import Skill
 from skillweave.skills.goals import goals_of
 from skillweave.skills.own_part import OwnPart
+from skillweave.skills.skill_set import SkillSet
 from skillweave.training.learning_task import LearningTask, skill_task
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.trainer import Course

@@ -15,20 +15,27 @@ from typing import Any, TypeVar, cast
 
 from gymnasium import Space
 
+from skillweave._internal.messages import short
+from skillweave._internal.paths import (
+    CRITIC,
+    SELECTOR,
+    is_below,
+    join,
+    level_of,
+    levels_to,
+    name_of,
+)
 from skillweave.algorithms.config import AlgorithmConfig
-from skillweave.collecting.lengths import Lengths
-from skillweave.collecting.skill_set import LimitedCalls, SkillSet
-from skillweave.collecting.user_code import Texts, environment_texts, skill_texts
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.settings import Settings
-from skillweave.messages import short
-from skillweave.paths import CRITIC, SELECTOR, is_below, join, level_of, levels_to, name_of
-from skillweave.selectors import ReadySelector, ready_selector
-from skillweave.skills import Skill, is_trained
+from skillweave.runs.user_code import Texts, environment_texts, skill_texts
+from skillweave.skills import ReadySelector, Skill, is_trained, ready_selector
 from skillweave.skills.learnable import Learnable
+from skillweave.skills.lengths import Lengths
 from skillweave.skills.own_part import OwnPart, declared_sees
 from skillweave.skills.residual import Residual
+from skillweave.skills.skill_set import LimitedCalls, SkillSet
 from skillweave.training.role import Role
 from skillweave.types import Policy
 

@@ -9,19 +9,19 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from skillweave._internal.paths import SELECTOR, decides, join
 from skillweave.algorithms.config import PPO, AlgorithmConfig, OnPolicy, SkillCritic
-from skillweave.collecting.learners import Calling
-from skillweave.collecting.search import Starts
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError
+from skillweave.experience.learners import Calling
+from skillweave.experience.search import Starts
 from skillweave.hierarchy.assembly import can_act, learning_set, policy_at
 from skillweave.hierarchy.checks import check_target
 from skillweave.hierarchy.fitting import active_guide
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.networks.config import Network
-from skillweave.paths import SELECTOR, decides, join
 from skillweave.policies.parts import OBSERVATION
 from skillweave.skills.goal_spaces import goal_part
+from skillweave.skills.skill_set import SkillSet
 from skillweave.spaces import obs_codec
 from skillweave.training.learning_task import (
     JointTask,

@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from skillweave._internal.paths import join, level_of, levels_to
 from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.hierarchy.schedule import open_choices
-from skillweave.paths import join, level_of, levels_to
 from skillweave.runs.comparison import SAMPLING, Candidate, Comparison
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import StageEntry

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, AlgorithmSettings
-from skillweave.collecting.lengths import Lengths
 from skillweave.errors import DeclarationError
 from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, settings
-from skillweave.selectors.ready import ReadyValue
 from skillweave.skills import Reflex
+from skillweave.skills.lengths import Lengths
 from skillweave.skills.own_part import ZERO
+from skillweave.skills.ready_selector import ReadyValue
 from skillweave.training.stage import Together
 
 StartCalls = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from skillweave._internal.paths import SELECTOR, level_of
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy.assembly import assembled, can_act
@@ -18,11 +19,10 @@ from skillweave.hierarchy.schedule import budgets_of, level_stages, stages_of
 from skillweave.hierarchy.select_best import resolve_greedy, select_best
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
-from skillweave.paths import SELECTOR, level_of
 from skillweave.planning import Planner
 from skillweave.runs.command_words import repair_words, resume_words
-from skillweave.runs.copies import copy_ready_policy, policy_at_start
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.initial_policies import copy_ready_policy, policy_at_start
 from skillweave.runs.manifest import Manifest
 from skillweave.runs.trackers import Listener
 from skillweave.skills import ready_policy

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.messages import short
+from skillweave._internal.paths import AGENT, below, join, level_of
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
-from skillweave.collecting.user_code import environment_texts, notice_changes
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
 from skillweave.hierarchy.assembly import assembled, own_parts_of, parts_of
@@ -28,11 +29,10 @@ from skillweave.hierarchy.recorded import (
     with_entry,
 )
 from skillweave.hierarchy.roles import Level, Roles
-from skillweave.messages import short
-from skillweave.paths import AGENT, below, join, level_of
 from skillweave.policies.files import shown
 from skillweave.runs.files import read_tensors, record_in, write_tensors
 from skillweave.runs.manifest import GuideEntry, Recorded
+from skillweave.runs.user_code import environment_texts, notice_changes
 from skillweave.skills.foreign_policy import Foreign, as_recorded
 from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
 from skillweave.spaces import same_space

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
+from skillweave._internal.named import named
 from skillweave.errors import DeclarationError
-from skillweave.named import named
 from skillweave.schema import Check, Count, check, settings
 
 T = TypeVar("T")

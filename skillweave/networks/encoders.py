@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.named import Named, known_names
 from skillweave.errors import DeclarationError
-from skillweave.named import Named, known_names
 from skillweave.networks.config import CNN, Activation
 from skillweave.networks.own import ModuleEncoder
 from skillweave.networks.stacked import ACTIVATIONS, Inputs, Views, orthogonal_

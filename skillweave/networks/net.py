@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from skillweave._internal.messages import suggest
 from skillweave.errors import DeclarationError
-from skillweave.messages import suggest
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Encoder, ImageEncoder, Inputs, make_encoder, part, under
 from skillweave.networks.stacked import (

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
+from skillweave._internal.messages import error_text, short
+from skillweave._internal.named import Named
 from skillweave.errors import DeclarationError, SkillweaveError
-from skillweave.messages import error_text, short
-from skillweave.named import Named
 from skillweave.networks.stacked import Inputs, Views
 from skillweave.ops.device import Constant, usual_defaults
 from skillweave.spaces import ObsCodec

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skillweave.shapes import Bool, Float, Int
+from skillweave._internal.shapes import Bool, Float, Int
 
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 

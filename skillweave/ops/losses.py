@@ -10,8 +10,8 @@ import math
 import torch
 from torch import Tensor
 
+from skillweave._internal.shapes import Float
 from skillweave.ops.moments import masked_mean
-from skillweave.shapes import Float
 
 LARGEST_LOG_RATIO = 20.0
 """The largest log of a ratio of probabilities. Where a policy's deviation is nearly 0, an action of

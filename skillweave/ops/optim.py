@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from skillweave._internal.shapes import Bool, Float, Int
 from skillweave.ops.device import all_false
-from skillweave.shapes import Bool, Float, Int
 
 FEWEST_FUSED = 2048
 """Parameters of a member from which torch's own Adam is faster than single operations."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from skillweave.shapes import Bool, Float
+from skillweave._internal.shapes import Bool, Float
 
 
 def gae(

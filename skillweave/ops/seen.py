@@ -7,7 +7,7 @@ from functools import cached_property
 
 from torch import Tensor
 
-from skillweave.notices import notice
+from skillweave._internal.notices import notice
 from skillweave.ops.moments import CLIP, scale_of
 
 FEWEST = 1_000

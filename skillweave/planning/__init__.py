@@ -1,4 +1,7 @@
-"""Know and plan: tasks without training, logs of calls, and planning on them."""
+"""Tasks without training: logs of calls, what they say about skills, and plans on them.
+
+Begin with ``calls``, the log; ``machine`` says what a task is, and ``planner`` solves it.
+"""
 
 from skillweave.planning.calls import CallLog, join
 from skillweave.planning.explorer import Explorer

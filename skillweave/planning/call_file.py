@@ -11,10 +11,9 @@ import gymnasium as gym
 import numpy as np
 from torch import Tensor
 
-from skillweave.collecting.user_code import Texts
+from skillweave._internal.messages import as_path
+from skillweave.algorithms.batches import INFO
 from skillweave.errors import RunError, SkillweaveError
-from skillweave.experience import INFO
-from skillweave.messages import as_path
 from skillweave.planning.columns import (
     GOAL,
     PER_CALL,
@@ -25,6 +24,7 @@ from skillweave.planning.columns import (
 )
 from skillweave.policies.core import CallEnd
 from skillweave.runs.files import read_tensors, record_in, write_tensors
+from skillweave.runs.user_code import Texts
 from skillweave.schema import AtLeastOne, Count
 from skillweave.skills.base import NAME
 from skillweave.spaces import (

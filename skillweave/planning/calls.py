@@ -10,22 +10,22 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.skill_set import SkillSet
-from skillweave.collecting.user_code import (
-    Texts,
-    changes,
-    environment_texts,
-    notice_changes,
-    skill_texts,
-)
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, RunError
 from skillweave.planning.call_file import read_calls, write_calls
 from skillweave.planning.columns import PER_CALL, PER_STEP
 from skillweave.planning.handover import LinkedCalls
 from skillweave.policies.files import checksum
+from skillweave.runs.user_code import (
+    Texts,
+    changes,
+    environment_texts,
+    notice_changes,
+    skill_texts,
+)
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import without_goal
+from skillweave.skills.skill_set import SkillSet
 from skillweave.spaces import obs_codec, same_space
 
 LEARNING = "learning"

@@ -13,11 +13,11 @@ from typing import Any, Self
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.user_code import Texts
+from skillweave._internal.messages import shortened, suggest
+from skillweave.algorithms.batches import INFO
 from skillweave.errors import DeclarationError
-from skillweave.experience import INFO
-from skillweave.messages import shortened, suggest
 from skillweave.policies.core import CallEnd, Choices
+from skillweave.runs.user_code import Texts
 from skillweave.spaces import obs_codec, obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array, Step
 

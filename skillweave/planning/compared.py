@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from skillweave._internal.messages import short, suggest
 from skillweave.errors import DeclarationError
-from skillweave.messages import short, suggest
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.lacking import read_log
 from skillweave.planning.machine import RewardMachine

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
 from skillweave.planning.calls import CallLog
 from skillweave.planning.graph import CallGraph, planning_states
 from skillweave.planning.machine import RewardMachine

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError
-from skillweave.messages import short
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.predicates import Predicate
-from skillweave.selectors.base import function_name
 from skillweave.skills.outputs import called, checked
+from skillweave.skills.selector import function_name
 from skillweave.types import Array, Step, read_only
 
 

@@ -17,9 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.skill_set import SkillSet
+from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, RunError
-from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
 from skillweave.planning.compared import feature_maps
 from skillweave.planning.goal import GoalTask
@@ -34,6 +33,7 @@ from skillweave.policies.plan import (
     Options,
     Readings,
 )
+from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Array
 
 LEVELS = 128

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import aligned, short, suggest
+from skillweave._internal.notebooks import table
 from skillweave.errors import DeclarationError, RunError
-from skillweave.messages import aligned, short, suggest
-from skillweave.notebooks import table
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import feature_maps
 from skillweave.planning.lacking import read_log

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short, suggest
 from skillweave.errors import DeclarationError
-from skillweave.messages import short, suggest
 from skillweave.planning.predicates import Event, Held, Predicate, as_event
 from skillweave.policies.plan import Machine
 from skillweave.schema import fitted
-from skillweave.selectors.automaton import Automaton, StateName, check_transitions
-from skillweave.selectors.base import Wrapped, checked_function, function_name, listed
+from skillweave.skills.automaton import Automaton, StateName, check_transitions
+from skillweave.skills.selector import Wrapped, checked_function, function_name, listed
 from skillweave.types import LARGEST_REWARD, Array, Step
 
 MOST_STATES = 10_000

@@ -1,16 +1,16 @@
-"""Missions (sequences, choices and repetitions of events), and every kind of task in one form."""
+"""Missions (sequences, choices and repetitions of events), also as text; every task in one form."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, NoReturn
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short, suggest
 from skillweave.errors import DeclarationError
-from skillweave.messages import short
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.mission_text import parse
 from skillweave.planning.parts import (
     MOST_TOGETHER,
     AnyOrder,
@@ -21,6 +21,8 @@ from skillweave.planning.parts import (
     sequence,
 )
 from skillweave.planning.predicates import (
+    LONGEST_HOLD,
+    Event,
     Held,
     Predicate,
     as_event,
@@ -205,3 +207,202 @@ def as_task(value: Any, predicates: Mapping[str, Any] | None = None) -> Task:
         f"the task is {short(value)}; give a Mission or its text, a RewardMachine, a GoalTask, or "
         "a function of a step that returns the reward"
     )
+
+
+KEYWORDS = ("then", "or", "and", "not", "for", "avoid", "repeat")
+RESERVED = (*KEYWORDS, "forever", "steps", "step")
+"""Words that are no predicates."""
+LONGEST = 10_000
+"""The most characters of a text."""
+MOST_REPEATS = 1_000
+DEEPEST = 50
+"""The most parentheses inside one another."""
+_TOKEN = re.compile(r"\s*(?:(?P<word>[^\W\d][\w-]*)|(?P<number>\d+)|(?P<sign>[(),]))")
+
+
+class _Token(NamedTuple):
+    kind: str
+    """``word``, ``number``, ``sign`` or ``end``."""
+    text: str
+    at: int
+
+
+def parse(
+    text: str, predicates: Mapping[str, Event]
+) -> tuple[Part, tuple[Predicate, ...], int | None]:
+    """Return legs, what is to be avoided, and how often the legs repeat (None: forever).
+
+    Raises:
+        DeclarationError: a word is unknown or out of place; the message points at it.
+    """
+    fitted(str, text, "a mission")
+    if len(text) > LONGEST:
+        raise DeclarationError(f"a mission has {len(text):,} characters; at most {LONGEST:,}")
+    for name in predicates:
+        if name in RESERVED:
+            raise DeclarationError(
+                f"a predicate is named {name!r}, which is a word of missions; choose another name"
+            )
+    return _Parser(text, predicates).mission()
+
+
+class _Parser:
+    def __init__(self, text: str, predicates: Mapping[str, Event]) -> None:
+        self.text, self.predicates = text, predicates
+        self.tokens = list(self._tokens())
+        self.place = self.depth = 0
+
+    def mission(self) -> tuple[Part, tuple[Predicate, ...], int | None]:
+        """Parse the whole text."""
+        legs = self.sequence()
+        avoid: list[Predicate] = []
+        repeat: int | None = 1
+        repeated = False
+        while self.now.kind != "end":
+            self.expect(",", "'then', 'or', 'and', or a comma")
+            if self.takes("avoid"):
+                avoid += self.avoided()
+            elif self.now.text == "repeat":
+                if repeated:
+                    self.fail("the mission repeats twice; leave one of them out")
+                self.take()
+                repeated = True
+                repeat = None if self.takes("forever") else self.number(1, MOST_REPEATS)
+            else:
+                self.fail("'avoid' or 'repeat' is expected after a comma")
+        return legs, tuple(avoid), repeat
+
+    def sequence(self) -> Part:
+        """Parse parts that are joined by ``then``."""
+        return sequence(self.joined("then", self.choice))
+
+    def choice(self) -> Part:
+        """Parse parts that are joined by ``or``."""
+        first, parts = self.now, self.joined("or", self.any_order)
+        if len(parts) > MOST_TOGETHER:
+            self.fail(f"a choice has at most {MOST_TOGETHER} parts", first)
+        return parts[0] if len(parts) == 1 else Choice(tuple(parts))
+
+    def any_order(self) -> Part:
+        """Parse parts that are joined by ``and``."""
+        first, parts = self.now, self.joined("and", self.item)
+        if len(parts) > MOST_TOGETHER:
+            self.fail(f"at most {MOST_TOGETHER} parts can be done in any order", first)
+        return parts[0] if len(parts) == 1 else AnyOrder(tuple(parts))
+
+    def joined(self, word: str, parse: Callable[[], Part]) -> list[Part]:
+        """Parse parts with a word between them."""
+        parts = [parse()]
+        while self.takes(word):
+            parts.append(parse())
+        return parts
+
+    def item(self) -> Part:
+        """Parse parentheses, or an event."""
+        first = self.now
+        if self.takes("("):
+            self.depth += 1
+            if self.depth > DEEPEST:
+                self.fail(f"at most {DEEPEST} parentheses may be inside one another", first)
+            inside = self.sequence()
+            self.depth -= 1
+            self.expect(")", "')', 'then', 'or' or 'and'")
+            if self.takes("repeat"):
+                return sequence([inside] * self.number(1, MOST_REPEATS))
+            return inside
+        event = self.event()
+        if self.takes("for"):
+            if isinstance(event, Held):
+                self.fail(f"{event.predicate.name!r} has its number of steps already", first)
+            steps = self.number(1, LONGEST_HOLD)
+            if not self.takes("steps"):
+                self.takes("step")
+            event = event if steps == 1 else Held(event, steps)
+        if self.now.text == "repeat":
+            self.fail("put the part that repeats in parentheses, or a comma before 'repeat'")
+        return event
+
+    def event(self) -> Event:
+        """Parse a predicate's name, perhaps after ``not``."""
+        first = self.now
+        negated = first if self.takes("not") else None
+        token = self.take()
+        if token.kind != "word" or token.text in KEYWORDS:
+            self.fail("the name of a predicate is expected here", token)
+        if token.text not in self.predicates:
+            if not self.predicates:
+                name = token.text
+                self.fail(f"{name!r} is no known predicate: give predicates={{{name!r}: …}}", token)
+            end = suggest(token.text, self.predicates)
+            self.fail(f"{token.text!r} is no known predicate{end}", token)
+        event = self.predicates[token.text]
+        if negated is None:
+            return event
+        if isinstance(event, Held):
+            self.fail("'not' goes before a predicate without a number of steps", negated)
+        return ~event
+
+    def avoided(self) -> list[Predicate]:
+        """Parse the names after ``avoid``."""
+        predicates: list[Predicate] = []
+        while True:
+            token = self.now
+            event = self.event()
+            if isinstance(event, Held):
+                self.fail("what is avoided must be a predicate of one step", token)
+            predicates.append(event)
+            if not (self.takes("or") or self.takes("and")):
+                return predicates
+
+    @property
+    def now(self) -> _Token:
+        return self.tokens[self.place]
+
+    def take(self) -> _Token:
+        token = self.now
+        self.place += token.kind != "end"
+        return token
+
+    def takes(self, text: str) -> bool:
+        """Return whether the next token is this one, and step over it."""
+        if self.now.kind in ("word", "sign") and self.now.text == text:
+            self.place += 1
+            return True
+        return False
+
+    def expect(self, text: str, wanted: str) -> None:
+        if not self.takes(text):
+            self.fail(f"{wanted} is expected here")
+
+    def number(self, least: int, most: int) -> int:
+        token = self.take()
+        if token.kind != "number":
+            self.fail("a whole number is expected here", token)
+        # Longer numbers than Python converts are too large in any case.
+        if len(token.text) > 12 or not least <= int(token.text) <= most:
+            self.fail(f"the number must be from {least:,} to {most:,}", token)
+        return int(token.text)
+
+    def fail(self, reason: str, token: _Token | None = None) -> NoReturn:
+        """Raise an error whose second line shows the text, and whose third points at a word."""
+        token = token or self.now
+        shown, at = self.text.expandtabs(1), token.at
+        # A window of the text, so that the pointer is below its word in any terminal.
+        first = max(0, at - 50)
+        line = " ".join(shown[first : at + 30].splitlines())
+        pointer = " " * (at - first) + "^" * max(1, len(token.text))
+        raise DeclarationError(f"mission: {reason}\n  {line}\n  {pointer}")
+
+    def _tokens(self) -> list[_Token]:
+        tokens: list[_Token] = []
+        place, end = 0, len(self.text.rstrip())
+        while place < end:
+            match = _TOKEN.match(self.text, place)
+            if match is None:
+                skipped = len(self.text[place:]) - len(self.text[place:].lstrip())
+                wrong = _Token("sign", self.text[place + skipped], place + skipped)
+                self.fail("this sign has no meaning in a mission", wrong)
+            kind = str(match.lastgroup)
+            tokens.append(_Token(kind, match[kind], match.start(kind)))
+            place = match.end()
+        return [*tokens, _Token("end", "", end)]

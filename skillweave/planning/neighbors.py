@@ -11,12 +11,12 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from skillweave._internal.messages import error_text, short
 from skillweave.errors import DeclarationError
-from skillweave.messages import error_text, short
 from skillweave.ops.moments import is_constant, scale_of
 from skillweave.ops.seen import Seen
 from skillweave.policies import plan
-from skillweave.selectors.base import Wrapped
+from skillweave.skills.selector import Wrapped
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
 

@@ -11,11 +11,10 @@ from typing import Annotated, Any, Self
 import gymnasium as gym
 import numpy as np
 
-from skillweave.arguments import checked_names
-from skillweave.collecting.skill_set import SkillSet, skills_below
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
+from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, RunError
-from skillweave.messages import short
-from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
 from skillweave.planning.columns import columns_of
 from skillweave.planning.goal import GoalTask
@@ -29,7 +28,8 @@ from skillweave.policies.plan import Near
 from skillweave.policies.planned import Planned
 from skillweave.policies.spaces import space_of
 from skillweave.schema import AtLeastOne, Check, Fraction, fitted
-from skillweave.selectors.base import ReadySelector
+from skillweave.skills.selector import ReadySelector
+from skillweave.skills.skill_set import SkillSet, skills_below
 from skillweave.types import Array
 
 MOST_GOALS = 256

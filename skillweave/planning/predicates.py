@@ -11,13 +11,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError, SkillError
-from skillweave.messages import short
 from skillweave.schema import AtLeastOne, fitted
-from skillweave.selectors.base import function_name
 from skillweave.skills import Skill
 from skillweave.skills.outputs import answer
+from skillweave.skills.selector import function_name
 from skillweave.types import Array, Step
 
 Reads = Literal["obs", "step"]

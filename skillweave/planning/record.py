@@ -10,14 +10,14 @@ from typing import Any, Protocol, runtime_checkable
 import gymnasium as gym
 import numpy as np
 
-from skillweave.arguments import checked_names
-from skillweave.collecting.interrupts import deferred, requested
-from skillweave.collecting.skill_set import SkillSet, acting_policy, in_place, skills_below
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.interrupts import deferred, requested
+from skillweave._internal.messages import short
+from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.envs.engine import Engine, GymnasiumEngine, episode_seed
 from skillweave.envs.infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError, Interrupted
-from skillweave.messages import short
 from skillweave.planning.calls import CallLog
 from skillweave.planning.explorer import Explorer
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
@@ -32,9 +32,9 @@ from skillweave.policies.core import (
 )
 from skillweave.policies.parts import GOAL
 from skillweave.schema import AtLeastOne, fitted
-from skillweave.seeding import Seeds, global_generators
-from skillweave.selectors import ReadySelector, ready_selector
+from skillweave.skills import ReadySelector, ready_selector
 from skillweave.skills.goal_spaces import blank_choices
+from skillweave.skills.skill_set import SkillSet, acting_policy, in_place, skills_below
 from skillweave.spaces import same_space
 from skillweave.types import Array
 

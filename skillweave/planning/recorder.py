@@ -14,19 +14,19 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.skill_set import SkillSet, skills_below
-from skillweave.collecting.user_code import Texts, environment_texts
-from skillweave.collecting.views import call_successes, info_numbers_of, judged
-from skillweave.collecting.writer import TraceWriter
+from skillweave._internal.paths import join
+from skillweave.algorithms.batches import INFO, OF_STEP, Batch, Trace
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
-from skillweave.experience import INFO, OF_STEP, Batch, Trace
-from skillweave.paths import join
+from skillweave.experience.views import call_successes, info_numbers_of, judged
+from skillweave.experience.writer import TraceWriter
 from skillweave.planning.calls import CallLog, seen_places, skill_checksums, skill_code
 from skillweave.planning.columns import GOAL, PER_CALL, PER_STEP, call_fields
 from skillweave.policies.core import LIMIT, RUNNING
+from skillweave.runs.user_code import Texts, environment_texts
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goals import Goals, goals_of
+from skillweave.skills.skill_set import SkillSet, skills_below
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.types import Array, Memory, Step
 

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.user_code import changes
+from skillweave._internal.messages import shown_path
+from skillweave._internal.notices import notice
+from skillweave._internal.paths import CRITIC, SELECTOR
 from skillweave.errors import RunError
-from skillweave.messages import shown_path
-from skillweave.notices import notice
-from skillweave.paths import CRITIC, SELECTOR
 from skillweave.planning.call_file import LoggedRun, write_calls
 from skillweave.planning.calls import CallLog, join
 from skillweave.planning.columns import columns_of
@@ -24,6 +23,7 @@ from skillweave.policies.files import check_file
 from skillweave.runs.directory import CALLS, CALLS_LOCK, RunDirectory
 from skillweave.runs.files import read_header
 from skillweave.runs.lock import Lock
+from skillweave.runs.user_code import changes
 from skillweave.schema import fit
 
 MOST_STEPS = 1_000_000

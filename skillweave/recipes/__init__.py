@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from skillweave.shipped import file_of, names, source, weights_path
+from skillweave._internal.shipped import file_of, names, source, weights_path
 
 if TYPE_CHECKING:
     from skillweave import Hierarchy

@@ -1,1 +1,4 @@
-"""Output for people: progress, captions, videos, reports."""
+"""What people look at: progress, films, figures, and the report of a run in ``report``.
+
+Begin with ``report/single``; ``report/facts`` has the facts that all of them print.
+"""

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import as_path, short, suggest
 from skillweave.errors import DeclarationError, RunError, needs_extra
-from skillweave.messages import as_path, short, suggest
 from skillweave.reporting.report.curves import read_curves
 from skillweave.reporting.report.groups import grouped, on_one_grid
 from skillweave.reporting.report.verdict import is_binary

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from skillweave.notebooks import Area, Markup, in_notebook, joined, paragraph, table
-from skillweave.terminal import end_quietly, printable
+from skillweave._internal.notebooks import Area, Markup, in_notebook, joined, paragraph, table
+from skillweave._internal.terminal import end_quietly, printable
 
 
 @dataclass

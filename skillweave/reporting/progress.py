@@ -13,10 +13,10 @@ from typing import Any, Self
 
 import numpy as np
 
+from skillweave._internal.terminal import printable, say
 from skillweave.reporting.displays import Display, Row, open_display
 from skillweave.runs.manifest import StageEntry
 from skillweave.runs.trackers import Listener
-from skillweave.terminal import printable, say
 from skillweave.training.episodes import INFO
 
 EVERY = 5.0

@@ -12,19 +12,19 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave._internal.messages import error_text
+from skillweave._internal.notebooks import Markup, joined, paragraph
+from skillweave._internal.seeding import Seeds, global_generators
+from skillweave._internal.terminal import printable
 from skillweave.envs.checks import LONG_EPISODE
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
-from skillweave.messages import error_text
-from skillweave.notebooks import Markup, joined, paragraph
 from skillweave.reporting.palette import BAND, BLACK, LINE, PALETTE, RGB, WHITE, color_of, is_light
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.schema import AtLeastOne, Count, fitted
-from skillweave.seeding import Seeds, global_generators
-from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.types import Array, Memory, Policy
 

@@ -1,1 +1,4 @@
-"""The run directory: files, checkpoints, metrics, trackers."""
+"""The run directory: what training writes and everything else reads.
+
+Begin with ``directory``, its files; ``manifest`` has the schemas of what is in them.
+"""

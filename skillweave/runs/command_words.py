@@ -10,7 +10,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Literal, Protocol
 
-from skillweave.messages import shown_path
+from skillweave._internal.messages import shown_path
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.manifest import Manifest, RepairEntry
 

@@ -33,14 +33,15 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
+from skillweave._internal.messages import absolute, shown_path
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy, state_from
 from skillweave.errors import DeclarationError, RunError
-from skillweave.messages import absolute, shown_path
 from skillweave.policies.files import shown
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import load_words, resume_words, saved_words
 from skillweave.runs.files import (
     TEMPORARY,
+    check_no_links,
     check_unchanged,
     make_directory,
     read_signed,
@@ -51,7 +52,6 @@ from skillweave.runs.files import (
     write_tensors,
 )
 from skillweave.runs.jsonl import JsonLines
-from skillweave.runs.links import check_no_links
 from skillweave.runs.lock import NAME as LOCK, Lock
 from skillweave.runs.manifest import (
     Checkpoint,

@@ -14,12 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
+from skillweave._internal.messages import short, shortened
 from skillweave.errors import DeclarationError, RunError, SkillweaveError, needs_extra
-from skillweave.messages import short, shortened
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import CALLS, RunDirectory
-from skillweave.runs.files import json_bytes
-from skillweave.runs.links import check_no_links_around
+from skillweave.runs.files import check_no_links_around, json_bytes
 from skillweave.runs.manifest import Manifest
 
 KINDS = (".safetensors", ".json", ".jsonl", ".md", ".gif", ".mp4", ".png")

@@ -1,6 +1,6 @@
-"""Initial policies of a run's learners from another run.
+"""A run's copies of policies: those that were ready when it began, and initial ones of other runs.
 
-They are copied into the run when it begins, so a run does not depend on other runs.
+They are copied when the run begins, so it does not depend on other runs and files.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from skillweave._internal.paths import SELECTOR, decides, level_of, name_of
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.errors import DeclarationError, RunError
-from skillweave.paths import SELECTOR, decides, level_of, name_of
+from skillweave.policies.files import read_file
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import (
@@ -23,9 +24,12 @@ from skillweave.runs.files import (
     read_signed,
     record_in,
     remove,
+    write_bytes,
     write_tensors,
 )
 from skillweave.runs.manifest import Manifest, SkillEntry, StageEntry, Start
+from skillweave.skills.foreign_policy import Foreign, as_recorded
+from skillweave.types import Policy
 
 
 @dataclass(frozen=True)
@@ -187,3 +191,34 @@ def remove_initial_policies(run: RunDirectory, stage: str) -> None:
 
 def _path(run: RunDirectory, name: str) -> Path:
     return run.path / "starts" / f"{file_name(name)}.safetensors"
+
+
+def copy_ready_policy(run: RunDirectory, skill: str, policy: Policy) -> None:
+    """Copy the content of a skill's ready policy into the run, if it has content to copy."""
+    if isinstance(policy, Foreign) and (content := policy.content()) is not None:
+        path = _copy_path(run, skill, policy)
+        if not path.exists():  # a resumed run has it
+            run.check()
+            make_directory(path.parent)
+            write_bytes(path, content, make_directories=False)
+
+
+def policy_at_start(run: RunDirectory, skill: str, policy: Policy) -> Policy:
+    """Return a skill's ready policy as it was when the run began.
+
+    Raises:
+        RunError: the policy has changed, and the run holds no copy.
+    """
+
+    def read() -> bytes | None:
+        assert isinstance(policy, Foreign)
+        path = _copy_path(run, skill, policy)
+        return read_file(path) if path.exists() else None
+
+    return as_recorded(
+        policy, run.manifest.by_path[skill].policy, read, f"{run.path}: skill {skill!r}"
+    )
+
+
+def _copy_path(run: RunDirectory, skill: str, policy: Foreign) -> Path:
+    return run.path / "policies" / f"{file_name(skill)}{policy.suffix}"

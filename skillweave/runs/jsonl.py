@@ -11,7 +11,7 @@ from typing import Any
 
 from skillweave.errors import RunError
 from skillweave.policies.files import check_file, load_json, shown
-from skillweave.runs.links import own_copy
+from skillweave.runs.files import own_copy
 from skillweave.schema import as_json, fit
 
 

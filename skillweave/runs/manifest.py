@@ -14,10 +14,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
 
+from skillweave._internal.paths import names_in
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentHeader
 from skillweave.errors import EnvError, RunError
-from skillweave.paths import names_in
 from skillweave.policies.files import shown
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.files import read_json, record_in
@@ -327,7 +327,7 @@ class Recorded:
     env: Annotated[str, Check("a text of at most 300 characters", lambda x: len(x) <= 300)]
     env_kwargs: dict[str, Any]
     code: dict[str, str] = field(default_factory=dict)
-    """Texts of the environment and the skills, to be compared (``collecting/user_code.py``)."""
+    """Texts of the environment and the skills, to be compared (``runs/user_code.py``)."""
     recipe: str | None = None
     hierarchy: LevelEntry | None = None
     """The outermost hierarchy; None: a plain agent."""

@@ -13,12 +13,12 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+from skillweave._internal.messages import error_text, suggest
+from skillweave._internal.terminal import say
 from skillweave.errors import DeclarationError, MissingExtra, RunError
-from skillweave.messages import error_text, suggest
 from skillweave.policies.core import flat
 from skillweave.runs.directory import RunDirectory
 from skillweave.schema import as_json
-from skillweave.terminal import say
 
 MLFLOW_EXPERIMENT = "skillweave"
 """The experiment of all runs, in MLflow."""

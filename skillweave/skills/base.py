@@ -13,10 +13,10 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from gymnasium import Space
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
+from skillweave._internal.notebooks import facts, joined
 from skillweave.errors import DeclarationError, SkillError
-from skillweave.messages import short
-from skillweave.notebooks import facts, joined
 from skillweave.policies.spaces import Space as Data
 from skillweave.schema import (
     AtLeastOne,

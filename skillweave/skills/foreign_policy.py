@@ -11,14 +11,14 @@ from typing import Any, Self
 import numpy as np
 from gymnasium import Space
 
+from skillweave._internal.messages import error_text, short
+from skillweave._internal.notices import notice
+from skillweave._internal.tracebacks import is_own_code
 from skillweave.errors import PolicyError, RunError, SkillweaveError
-from skillweave.messages import error_text, short
-from skillweave.notices import notice
 from skillweave.policies.files import checksum
 from skillweave.policies.spaces import at, space_of
 from skillweave.skills.goal_spaces import draw_from
 from skillweave.skills.probing import untouched, watch
-from skillweave.tracebacks import is_own_code
 from skillweave.types import Array, Memoryless, Policy
 
 SEES = "let sees= give the parts that it takes"

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.messages import short
+from skillweave._internal.messages import short
 from skillweave.policies.hierarchy import SKILL
 from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.policies.spaces import Space as Data, at, space_of

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError, EnvError, SkillError
-from skillweave.messages import short
 from skillweave.policies.hierarchy import TRIES, CallGoals
 from skillweave.policies.parts import joined
 from skillweave.policies.spaces import space_of

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.messages import short
+from skillweave._internal.messages import short
 from skillweave.policies.infos import NUMBERS
 from skillweave.types import Array
 

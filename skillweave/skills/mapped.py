@@ -14,9 +14,9 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box, Dict, Tuple
 
+from skillweave._internal.messages import short
+from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.messages import short
-from skillweave.notices import notice
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.functional import Functional
 from skillweave.policies.mapped import Input, Mapped, Model, numbers_of

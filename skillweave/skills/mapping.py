@@ -13,9 +13,9 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from skillweave._internal.messages import short
+from skillweave._internal.named import named
 from skillweave.errors import DeclarationError
-from skillweave.messages import short
-from skillweave.named import named
 from skillweave.policies.mapped import LONGEST
 from skillweave.schema import Check, fitted, settings
 

@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 from gymnasium import Space
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short, shortened
+from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, RunError, needs_extra
-from skillweave.messages import short, shortened
-from skillweave.notices import notice
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.files import check_file
 from skillweave.policies.mapped import OnnxFile, fits_shape, open_session

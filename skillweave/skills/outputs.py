@@ -10,12 +10,12 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from skillweave._internal.messages import error_text, short, suggest
+from skillweave._internal.tracebacks import is_users
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
-from skillweave.messages import error_text, short, suggest
 from skillweave.policies.infos import NUMBERS
 from skillweave.skills.info_words import missing_key, odd_key
 from skillweave.skills.probing import probe, watch
-from skillweave.tracebacks import is_users
 from skillweave.types import LARGEST_REWARD, Array, Step, read_only, wrong_reward
 
 OF_DICTS = ("no field of name", "dtype([", "VoidDType", "numpy.void")

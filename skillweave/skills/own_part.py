@@ -19,8 +19,8 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box, Dict, Discrete
 
+from skillweave._internal.messages import short, shortened, suggest
 from skillweave.errors import DeclarationError, PolicyError
-from skillweave.messages import short, shortened, suggest
 from skillweave.policies.mapped import Input
 from skillweave.policies.parts import Correction, Part
 from skillweave.policies.spaces import Space as Data, space_of

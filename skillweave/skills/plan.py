@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from gymnasium import Space
 
+from skillweave._internal.messages import short, shortened, suggest
 from skillweave.errors import PolicyError
-from skillweave.messages import short, shortened, suggest
 from skillweave.policies.mapped import (
     Input,
     Linear,

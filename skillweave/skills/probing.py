@@ -27,11 +27,11 @@ from typing import Any
 
 import numpy as np
 
+from skillweave._internal.messages import error_text
+from skillweave._internal.notices import notice
+from skillweave._internal.tracebacks import is_own_code
 from skillweave.errors import SkillError, SkillweaveError
-from skillweave.messages import error_text
-from skillweave.notices import notice
 from skillweave.policies.spaces import Space, discrete
-from skillweave.tracebacks import is_own_code
 from skillweave.types import Array, Step, read_only
 
 MOST = 256

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
+from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, SkillweaveError
-from skillweave.notices import notice
 from skillweave.skills.base import Skill, path_of
 from skillweave.skills.outputs import called
 from skillweave.skills.probing import first_time, untouched

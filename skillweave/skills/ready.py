@@ -8,8 +8,8 @@ from typing import Any
 
 from gymnasium import Space
 
+from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError, PolicyError
-from skillweave.messages import short
 from skillweave.policies.parts import GOAL
 from skillweave.skills.base import Skill, is_trained
 from skillweave.skills.foreign_policy import fitted

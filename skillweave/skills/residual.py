@@ -13,9 +13,9 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box, Dict, Tuple
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError
-from skillweave.messages import short
 from skillweave.policies.parts import Correction
 from skillweave.policies.spaces import space_of
 from skillweave.schema import Check, check_fields

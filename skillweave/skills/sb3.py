@@ -11,10 +11,10 @@ import numpy as np
 from gymnasium import Env, Space
 from gymnasium.spaces import Box, Dict, MultiBinary
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import error_text, short, shortened
+from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, needs_extra
-from skillweave.messages import error_text, short, shortened
-from skillweave.notices import notice
 from skillweave.policies.core import Turn
 from skillweave.policies.files import check_file, checksum, read_file
 from skillweave.policies.mapped import Shapes

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 from gymnasium.spaces import Dict, Tuple
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError, PolicyError
-from skillweave.messages import short
 from skillweave.policies.core import Memory, Policy as InPlace, Turn
 from skillweave.policies.mapped import Function
 from skillweave.policies.parts import GOAL

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from gymnasium import Space
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short, shortened
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.messages import short, shortened
 from skillweave.policies.core import Turn
 from skillweave.policies.files import checksum, read_file
 from skillweave.policies.mapped import invoke, of_model, parted, rows_first, states_of

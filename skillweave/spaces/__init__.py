@@ -1,7 +1,7 @@
-"""Gymnasium spaces to tensors and back.
+"""Gymnasium spaces to arrays and tensors, and back.
 
-``pack`` makes one array of a batch of observations, ``ObsCodec`` converts it to the inputs of
-networks; ``ActionCodec`` converts actions of a policy to the environment's.
+Begin with ``packing``: it makes one array of a batch of observations. ``ObsCodec`` makes inputs of
+networks of it, ``ActionCodec`` converts actions of a policy to the environment's.
 """
 
 from skillweave.spaces.action_codec import (

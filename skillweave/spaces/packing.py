@@ -12,8 +12,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave._internal.messages import short
 from skillweave.errors import EnvError
-from skillweave.messages import short
 from skillweave.types import Array
 
 OBSERVATIONS = "Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of these"

@@ -10,13 +10,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
+from skillweave._internal.tracebacks import place
 from skillweave.errors import DeclarationError
-from skillweave.messages import short
 from skillweave.runs.command_words import resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import Listener
-from skillweave.tracebacks import place
 
 
 @checked_names

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from skillweave.collecting.collector import FIRST_INFO
 from skillweave.errors import TrainingError
+from skillweave.experience.collector import FIRST_INFO
 from skillweave.types import Array
 
 WINDOW = 100  # episodes in the reported means

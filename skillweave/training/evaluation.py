@@ -7,30 +7,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace as replaced
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
 
-from skillweave.arguments import checked_names
-from skillweave.collecting.skill_set import skills_below
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
+from skillweave._internal.notebooks import joined, paragraph, table
+from skillweave._internal.notices import notice
+from skillweave._internal.seeding import Seeds, global_generators
+from skillweave._internal.terminal import printable
 from skillweave.envs.checks import longest_evaluation, time_limit
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import reported_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.envs.pool import POOL_SEEDS
 from skillweave.errors import DeclarationError, SkillweaveError
-from skillweave.messages import short
-from skillweave.notebooks import joined, paragraph, table
-from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
 from skillweave.policies.parts import OWN_GOAL
-from skillweave.schema import AtLeastOne, Count, fitted
-from skillweave.seeding import Seeds, global_generators
+from skillweave.schema import UNSAVED, AtLeastOne, Count, fitted
 from skillweave.skills import Skill
 from skillweave.skills.foreign_policy import Foreign, check_spaces
 from skillweave.skills.goals import goals_of
-from skillweave.terminal import printable
+from skillweave.skills.skill_set import skills_below
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.training.skill_report import (
@@ -60,6 +60,20 @@ SCORE_ALONE = 'evaluate(skill="go_to") scores a skill alone'
 
 
 @dataclass(frozen=True)
+class Details:
+    """What an evaluation knows beside its scores, and does not save; None: it has none."""
+
+    logs: dict[str, CallLog] | None = None
+    """The calls of each level, by its path."""
+    handovers: tuple[str, ...] = ()
+    """Sentences on skills that seldom succeed after one other skill."""
+    goals: Array | None = None
+    """Of a skill that acted alone: the goal of each episode, (episodes, …)."""
+    reached: Array | None = None
+    """Of a skill that acted alone: the success of each episode's call, (episodes,) bool."""
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """Scores of whole episodes; ``str()`` is a line for people.
 
@@ -79,6 +93,8 @@ class Evaluation:
     """Steps in which each reflex acted, by its path."""
     alone: str | None = None
     """The skill that acted alone, with one call in each episode; None: the whole policy acted."""
+    details: Details = field(default=Details(), repr=False, compare=False, metadata=UNSAVED)
+    """Logs, goals and hints, which ``calls``, ``goals`` and ``for_people`` tell."""
 
     def __post_init__(self) -> None:
         if not self.returns or len(self.returns) != len(self.lengths):
@@ -96,8 +112,7 @@ class Evaluation:
         Raises:
             DeclarationError: no calls were logged.
         """
-        calls: CallLog = self._kept("logs", NOT_LOGGED)[""]
-        return calls
+        return _known(self.details.logs, NOT_LOGGED)[""]
 
     @property
     def inner_calls(self) -> dict[str, CallLog]:
@@ -106,7 +121,7 @@ class Evaluation:
         Raises:
             DeclarationError: no calls were logged.
         """
-        return {path: log for path, log in self._kept("logs", NOT_LOGGED).items() if path}
+        return {path: log for path, log in _known(self.details.logs, NOT_LOGGED).items() if path}
 
     @property
     def goals(self) -> Array:
@@ -116,8 +131,7 @@ class Evaluation:
             DeclarationError: no skill with goals acted alone.
         """
         missing = "no skill with goals acted alone in this evaluation"
-        goals: Array = self._kept("goals", f"{missing}: {SCORE_ALONE}")
-        return goals
+        return _known(self.details.goals, f"{missing}: {SCORE_ALONE}")
 
     @property
     def reached(self) -> Array:
@@ -129,14 +143,7 @@ class Evaluation:
             DeclarationError: no skill that defines success acted alone.
         """
         missing = "no skill that defines success acted alone"
-        reached: Array = self._kept("reached", f"{missing}: {SCORE_ALONE}")
-        return reached
-
-    def _kept(self, name: str, missing: str) -> Any:
-        """Return what is not saved with the scores; where it is ``missing``, raise an error."""
-        if (kept := vars(self).get(f"_{name}")) is None:
-            raise DeclarationError(missing)
-        return kept
+        return _known(self.details.reached, f"{missing}: {SCORE_ALONE}")
 
     @property
     def mean(self) -> float:
@@ -205,7 +212,7 @@ class Evaluation:
 
     def _hints(self) -> list[str]:
         """Return hints of mistakes, and skills that seldom succeed after one other skill."""
-        return [*hints(self.skills), *(f"{s}." for s in vars(self).get("_handover", ()))]
+        return [*hints(self.skills), *(f"{s}." for s in self.details.handovers)]
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self}>"
@@ -356,7 +363,8 @@ def _evaluate(
         calls = PlayedCalls(policy, spaces, own_rewards=True, **how)
         evaluation = _scored(policy, episodes, moments, watch, threshold, calls)
         if info is not None:
-            vars(evaluation)["_logs"] = calls.logs([-1] * episodes if pooled else seeds)
+            logs = calls.logs([-1] * episodes if pooled else seeds)
+            evaluation = replaced(evaluation, details=replaced(evaluation.details, logs=logs))
         if spec.check_seed and not pooled and episodes > envs.num_envs:
             _check_starts_again(envs, seeds[0], first, spec.name)
         return evaluation
@@ -460,7 +468,12 @@ def _scored(
             success[played.episode[played.over]] = succeeded[played.over]
         if watch is not None:
             watch(played)
-    evaluation = Evaluation(
+    reached = None
+    if skill is not None and skill.defines("success"):
+        rows, reached = calls.recorders()[""].rows(), np.zeros(episodes, bool)
+        reached[rows["episode"]] = rows["succeeded"]
+    handovers = tuple(weak_handovers(calls)) if has_skills else ()
+    return Evaluation(
         tuple(returns.tolist()),
         tuple(lengths.tolist()),
         threshold,
@@ -469,12 +482,15 @@ def _scored(
         None if np.isnan(success).any() else int(success.sum()),
         dict(calls.reflexes),
         None if skill is None else policy.path,
+        Details(None, handovers, goals, reached),
     )
-    vars(evaluation)["_handover"] = tuple(weak_handovers(calls)) if has_skills else ()
-    if skill is not None:
-        reached = None
-        if skill.defines("success"):
-            rows, reached = calls.recorders()[""].rows(), np.zeros(episodes, bool)
-            reached[rows["episode"]] = rows["succeeded"]
-        vars(evaluation).update(_goals=goals, _reached=reached)
-    return evaluation
+
+
+K = TypeVar("K")
+
+
+def _known(value: K | None, missing: str) -> K:
+    """Return what an evaluation knows; where it is ``missing``, raise an error."""
+    if value is None:
+        raise DeclarationError(missing)
+    return value

@@ -11,8 +11,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+from skillweave._internal.paths import names_in
 from skillweave.errors import RunError
-from skillweave.paths import names_in
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, record_in, write_json
 from skillweave.runs.hub import must_be_own

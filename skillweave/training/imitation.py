@@ -8,13 +8,13 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError
 from skillweave.ops.distributions import mask_logits
 from skillweave.ops.optim import adam_
 from skillweave.ops.threads import torch_threads
-from skillweave.seeding import Seeds
 from skillweave.spaces import pack, to_tensor
 from skillweave.types import Array
 

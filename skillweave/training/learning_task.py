@@ -8,14 +8,14 @@ from typing import Any, Protocol, TypeVar
 
 import gymnasium as gym
 
-from skillweave.collecting.acting import Acting
-from skillweave.collecting.collector import Collector
-from skillweave.collecting.learners import Alone, Calling
-from skillweave.collecting.search import Starts
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.experience.acting import Acting
+from skillweave.experience.collector import Collector
+from skillweave.experience.learners import Alone, Calling
+from skillweave.experience.search import Starts
 from skillweave.skills import Reflex
+from skillweave.skills.skill_set import SkillSet
 from skillweave.training.role import Role, agent_role
 
 C = TypeVar("C", bound=Collector)

@@ -21,12 +21,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.collecting import interrupts
-from skillweave.collecting.source import Source
-from skillweave.experience import Batch
+from skillweave._internal import interrupts
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Batch
+from skillweave.experience.source import Source
 from skillweave.ops.device import INT
 from skillweave.ops.threads import WorkThread, torch_threads
-from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, Tick, to_numbers
 from skillweave.training.learner import Learner, crossed

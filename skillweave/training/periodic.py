@@ -8,15 +8,15 @@ from typing import Any, cast
 
 import numpy as np
 
+from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.collector import RETURN, SUCCESS, Collector
 from skillweave.envs.checks import longest_evaluation
 from skillweave.envs.engine import Engine, GymnasiumEngine, RawStep, episode_seed
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import SkillweaveError, reworded
+from skillweave.experience.acting import Acting, Request
+from skillweave.experience.collector import RETURN, SUCCESS, Collector
 from skillweave.ops.threads import torch_threads
-from skillweave.seeding import Seeds, global_generators
 from skillweave.training.learner import crossed
 from skillweave.training.learning_task import LearningTask
 from skillweave.types import Array

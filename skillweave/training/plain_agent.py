@@ -7,16 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.paths import AGENT
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmSettings, check_spaces
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.arguments import checked_names
-from skillweave.collecting.user_code import environment_texts
 from skillweave.envs.make import EnvSpec, Spaces
-from skillweave.paths import AGENT
 from skillweave.runs.command_words import Caller
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Manifest
+from skillweave.runs.user_code import environment_texts
 from skillweave.schema import AtLeastOne, Share, check_fields
 from skillweave.spaces import action_codec
 from skillweave.training.checks import EnvValue, check_env, check_rollout
@@ -45,6 +45,7 @@ class Declared(InEnv, ABC):
     """The place of the declaration: a shipped recipe's name or a file; written into runs."""
     recorded = False
     """True for a run that was loaded without its code; some of what was declared is missing."""
+    _spec: EnvSpec | None = None
     _starts: Callable[[], Any] | None = None
     """Function that returns the policies with which learners start, by name; None: no function."""
 
@@ -64,10 +65,9 @@ class Declared(InEnv, ABC):
         """The environment, fully specified; the same object while ``env`` does not change."""
         if isinstance(self.env, EnvSpec):
             return self.env
-        known: EnvSpec | None = vars(self).get("_spec")
-        if known is None or known.env is not self.env:
-            known = vars(self)["_spec"] = EnvSpec(self.env)
-        return known
+        if self._spec is None or self._spec.env is not self.env:
+            self._spec = EnvSpec(self.env)
+        return self._spec
 
     @abstractmethod
     def check_spaces(self) -> Spaces:

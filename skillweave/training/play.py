@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from skillweave.collecting.skill_set import in_place
 from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
 from skillweave.policies.core import Memory as InPlaceMemory, Turn, World, flat, put, split, take
+from skillweave.skills.skill_set import in_place
 from skillweave.types import Array, Policy, Step
 
 

@@ -9,10 +9,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.judge import judge, seen_by
-from skillweave.collecting.skill_set import SkillSet, skills_below
+from skillweave._internal.paths import AGENT, join, level_of, names_in
 from skillweave.envs.make import EnvSpec
-from skillweave.paths import AGENT, join, level_of, names_in
+from skillweave.experience.judge import judge, seen_by
 from skillweave.planning.calls import CallLog
 from skillweave.planning.columns import GOAL, OF_CALL
 from skillweave.planning.recorder import SUMS, Recorder, TraceFeed, calls_in, goals_in, levels_below
@@ -21,6 +20,7 @@ from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills import Reflex, Skill, asked
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
+from skillweave.skills.skill_set import SkillSet, skills_below
 from skillweave.training.play import Played
 from skillweave.types import Array, Memory, Policy
 

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.batches import Rehearsal
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.errors import RunError
-from skillweave.experience import Rehearsal
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import (
     check_unchanged,
@@ -28,7 +29,6 @@ from skillweave.runs.files import (
     write_tensors,
 )
 from skillweave.runs.manifest import StageEntry
-from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.learner import Learner, RolloutLearner
 from skillweave.types import Array

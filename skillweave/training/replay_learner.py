@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams
+from skillweave.algorithms.batches import Batch
 from skillweave.buffers.replay import Relabel, ReplayStore, replay_store
-from skillweave.collecting.acting import ActionRepeat, Request
-from skillweave.experience import Batch
+from skillweave.experience.acting import ActionRepeat, Request
 from skillweave.ops.device import resolve_device
-from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.learner import (
     Learner,

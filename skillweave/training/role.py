@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 import gymnasium as gym
 
+from skillweave._internal.paths import AGENT, level_of
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
-from skillweave.paths import AGENT, level_of
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import choice_space, with_goal
 from skillweave.skills.own_part import OwnPart

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.messages import aligned
-from skillweave.paths import join, level_of
+from skillweave._internal.messages import aligned
+from skillweave._internal.paths import join, level_of
 from skillweave.planning.columns import ENDS
 from skillweave.planning.handover import Handover, pair_counts
 from skillweave.planning.recorder import Recorder

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from skillweave._internal.notices import notice
+from skillweave._internal.paths import SELECTOR, join
 from skillweave.algorithms.config import (
     AlgorithmConfig,
     config_from_json,
@@ -14,18 +16,16 @@ from skillweave.algorithms.config import (
 )
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.schedules import own_schedules
-from skillweave.collecting.start_methods import cannot_be_sent, runs_again, why_no_processes
 from skillweave.envs.make import EnvSpec, cores, workers_for
 from skillweave.errors import DeclarationError, SkillweaveError, reworded
-from skillweave.notices import notice
 from skillweave.ops.device import resolve_device
-from skillweave.paths import SELECTOR, join
 from skillweave.runs.manifest import StageEntry, Target
 from skillweave.schema import AtLeastOne, Fraction, NonNegative, Positive, settings
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.replay_learner import store_of
 from skillweave.training.role import Role
 from skillweave.types import Policy
+from skillweave.workers.start_methods import cannot_be_sent, runs_again, why_no_processes
 
 TOGETHER = "together"
 """Name of the stage in which all learn together."""

@@ -7,11 +7,11 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
+from skillweave._internal.messages import suggest
+from skillweave._internal.notices import notice
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.envs.checks import LONG_EPISODE, LONGEST_EPISODE
 from skillweave.errors import RunError, SkillweaveError, reworded
-from skillweave.messages import suggest
-from skillweave.notices import notice
 from skillweave.policies.files import shown
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import LINES, RunDirectory

@@ -8,13 +8,13 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.planning.recorder import Recorder
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import StageEntry, Target
-from skillweave.seeding import Seeds
 from skillweave.training.keep_best import KeepBest
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.stage import Policies

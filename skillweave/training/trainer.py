@@ -11,24 +11,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from skillweave._internal.interrupts import deferred
+from skillweave._internal.notices import notice
+from skillweave._internal.paths import names_in
+from skillweave._internal.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.acting import Acting
-from skillweave.collecting.collector import Collector
-from skillweave.collecting.group import MakeCollector
-from skillweave.collecting.interrupts import deferred
-from skillweave.collecting.placement import MakeCollectors, make_collectors
 from skillweave.errors import DeclarationError
-from skillweave.notices import notice
+from skillweave.experience.acting import Acting
+from skillweave.experience.collector import Collector
+from skillweave.experience.group import MakeCollector
 from skillweave.ops.device import resolve_device
-from skillweave.paths import names_in
 from skillweave.planning.recorder import Recorder
 from skillweave.planning.run_log import save_calls
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.initial_policies import initial_policy, remove_initial_policies
 from skillweave.runs.manifest import Checkpoint, StageEntry
 from skillweave.runs.trackers import Listener
-from skillweave.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Learner, Stack, keep_to_guide
 from skillweave.training.learning_task import LearningTask
@@ -40,6 +39,7 @@ from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import MakeLearner, StageRun, begin_as
 from skillweave.types import Array, Policy, prefixed, unprefixed
+from skillweave.workers.placement import MakeCollectors, make_collectors
 
 EARLY = 0.25
 """Share of a stage's budget after which skills without a call are reported."""

@@ -18,13 +18,13 @@ import torch
 from toys import transitions
 
 from skillweave import DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO, SkillweaveError
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import register_encoder
+from skillweave.algorithms.batches import Reference, Rehearsal, Rollout
 from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.shipping import packed, unpacked
 from skillweave.errors import DeclarationError
-from skillweave.experience import Reference, Rehearsal, Rollout
-from skillweave.seeding import Seeds
+from skillweave.workers.shipping import packed, unpacked
 
 P, B = 2, 16
 OBS = gym.spaces.Box(-1.0, 1.0, (3,))

@@ -26,6 +26,7 @@ from toys import (
     training,
 )
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import config as table
 from skillweave.algorithms.config import (
     DQN,
@@ -39,12 +40,11 @@ from skillweave.algorithms.config import (
 )
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm, next_values
-from skillweave.collecting.collector import Collector
-from skillweave.collecting.learners import Alone
 from skillweave.errors import DeclarationError, RunError
+from skillweave.experience.collector import Collector
+from skillweave.experience.learners import Alone
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.runs.files import read_tensors, record_in, write_tensors
-from skillweave.seeding import Seeds
 
 # The table: an algorithm's settings, what it sees, how it acts, how long it learns
 

@@ -16,14 +16,14 @@ from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTens
 from torch.utils._pytree import tree_map
 
 from skillweave import DQN, PPO, SAC, TD3, Network, SelfImitationPPO
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import rollouts
 from skillweave.algorithms.base import state_to
+from skillweave.algorithms.batches import Reference, Rollout, Sample
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError
-from skillweave.experience import Reference, Rollout, Sample
 from skillweave.networks.config import CNN, RNN
 from skillweave.ops.device import Constant, all_false, on_host, resolve_device
-from skillweave.seeding import Seeds
 from skillweave.training.learner import RolloutLearner, Stack, keep_to_guide
 
 P, T, B = 2, 4, 3

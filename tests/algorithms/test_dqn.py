@@ -11,11 +11,11 @@ import torch
 from gymnasium.spaces import Box, Discrete
 from toys import Toy, learn, transitions
 
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.config import DQN
 from skillweave.algorithms.dqn import DQNAlgorithm, State
-from skillweave.experience import Sample
 from skillweave.networks.config import Network
-from skillweave.seeding import Seeds
 
 P, B, A = 2, 7, 3
 LINEAR = DQN(num_envs=2, network=Network(()), loss="mse", learning_rate=1e-2)

@@ -11,13 +11,13 @@ import torch
 from gymnasium.spaces import Box, Discrete
 from toys import members_of, random_critic
 
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Batch, Rollout
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.algorithms.rollouts import rows_where
 from skillweave.buffers.rollout import RolloutStore
-from skillweave.experience import Batch, Rollout
 from skillweave.networks.config import RNN, Network
-from skillweave.seeding import Seeds
 
 T, B, OBS, ACTIONS = 6, 4, 3, 5
 CONFIG = PPO(

@@ -9,7 +9,9 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.actor_critic import Critics
+from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.config import (
     DQN,
     PPO,
@@ -21,11 +23,9 @@ from skillweave.algorithms.config import (
 from skillweave.algorithms.parameters import LARGEST
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.errors import DeclarationError, RunError
-from skillweave.experience import Sample
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.ops.losses import weighted_mean
 from skillweave.ops.returns import td_target
-from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
 
 NAN = float("nan")

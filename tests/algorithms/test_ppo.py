@@ -7,17 +7,17 @@ from gymnasium.spaces import Box, Discrete
 from torch import nn
 from toys import Echo, learn, members_of, random_critic, training
 
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Rollout
 from skillweave.algorithms.config import (
     PPO,
     config_from_json,
     config_to_json,
 )
 from skillweave.algorithms.ppo import PPOAlgorithm, State
-from skillweave.experience import Rollout
 from skillweave.networks.config import RNN, Network
 from skillweave.ops.moments import normalize
 from skillweave.ops.returns import gae
-from skillweave.seeding import Seeds
 
 T, B = 8, 6
 OBS = Box(-np.inf, np.inf, (3,), np.float32)

@@ -10,15 +10,15 @@ from torch.distributions import Categorical, Independent, Normal, kl_divergence
 from toys import Toy, learn
 
 from skillweave import PPO, Network
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import ppo
+from skillweave.algorithms.batches import Reference, Rollout
 from skillweave.algorithms.parameters import epsilon_now
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import RehearsalRows, Terms, samples_of
 from skillweave.errors import DeclarationError
-from skillweave.experience import Reference, Rollout
 from skillweave.networks.heads import ActionHead
 from skillweave.ops.distributions import with_epsilon
-from skillweave.seeding import Seeds
 from skillweave.spaces import action_codec
 from skillweave.training.learner import adapted
 from skillweave.training.rehearsal import rehearsal_of

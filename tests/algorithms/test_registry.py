@@ -14,6 +14,7 @@ import torch
 from toys import Countdown, Echo, Masked, learn, own_algorithm as example
 
 from skillweave import PPO, SAC, Apart, Hierarchy, Network, Skill, train_agent
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import Algorithm, config as table, register_algorithm
 from skillweave.algorithms.config import OnPolicy, config_from_json, config_to_json, named_config
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
@@ -21,7 +22,6 @@ from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution import Evolution, Mutations
 from skillweave.runs.files import read_tensors, record_in, write_tensors
-from skillweave.seeding import Seeds
 
 BOX, LINE = gym.spaces.Box(-1, 1, (2,), np.float32), gym.spaces.Discrete(2)
 

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from skillweave import PPO, RNN, Network
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Reference, Rollout
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.ppo import Terms, samples_of
-from skillweave.experience import Reference, Rollout
-from skillweave.seeding import Seeds
 
 SEEN = gym.spaces.Box(-1, 1, (3,), np.float32)
 LINE, FORCE = gym.spaces.Discrete(4), gym.spaces.Box(-1, 1, (2,), np.float32)

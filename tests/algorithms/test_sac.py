@@ -13,13 +13,13 @@ from gymnasium.spaces import Box, Discrete
 from torch.distributions import Categorical, Normal, TanhTransform, TransformedDistribution
 from toys import Masked, Toy, learn, transitions
 
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.sac import SACAlgorithm, State
 from skillweave.errors import DeclarationError
-from skillweave.experience import Sample
 from skillweave.networks.config import Network
 from skillweave.ops.losses import critic_loss, masked_entropy_target
-from skillweave.seeding import Seeds
 
 P, B = 2, 6
 LINEAR = SAC(num_envs=2, network=Network(()), learning_rate=1e-2, normalize_obs=False)

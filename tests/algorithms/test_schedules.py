@@ -23,6 +23,7 @@ from small_runs import (
 
 import skillweave as sw
 from skillweave import DQN, PPO, SAC, TD3, Hierarchy, Linear, SelfImitationPPO
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import SkillCritic, config_from_json, config_to_json
 from skillweave.algorithms.parameters import rate_now
 from skillweave.algorithms.policy import make_algorithm
@@ -31,7 +32,6 @@ from skillweave.errors import DeclarationError
 from skillweave.evolution import Evolution, Mutations, Range
 from skillweave.runs.manifest import read_manifest
 from skillweave.schema import as_json
-from skillweave.seeding import Seeds
 
 KINDS = (PPO, SelfImitationPPO, SkillCritic, DQN, SAC, TD3)
 often = reports_every(75)
@@ -115,7 +115,7 @@ def test_a_function_is_checked_each_time_it_is_used():
 
 def _named_global(function: Any) -> Any:
     """A schedule whose name can be recorded, whatever it reads."""
-    from skillweave.named import Named
+    from skillweave._internal.named import Named
 
     found = Named("test_schedules:changing")
     found.function = function
@@ -167,7 +167,7 @@ def test_a_plain_agents_function_is_needed_to_resume_and_not_to_load(tmp_path, m
         run = sw.train_agent("CartPole-v1", config, 100, tmp_path / str(needs), quiet=True)
         manifest = read_manifest(run.path)
         assert (manifest.resume_needs_recipe, manifest.needs_recipe) == (needs, False)
-    from skillweave import named
+    from skillweave._internal import named
 
     monkeypatch.setattr(named, "_KNOWN", {})
     agent = sw.Agent.from_manifest(as_json(manifest))

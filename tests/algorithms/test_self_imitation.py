@@ -8,11 +8,11 @@ import torch
 from gymnasium.spaces import Box, Discrete
 
 from skillweave import PPO, Network, SelfImitationPPO
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Rollout
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError, RunError
-from skillweave.experience import Rollout
-from skillweave.seeding import Seeds
 from skillweave.training.learner import Stack
 
 SEEN, THREE = Box(-1.0, 1.0, (2,), np.float32), Discrete(3)

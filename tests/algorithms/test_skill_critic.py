@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Rollout
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.experience import Rollout
 from skillweave.networks.config import Network
-from skillweave.seeding import Seeds
 
 SEEN = gym.spaces.Box(0, 1, (3,), np.float32)
 

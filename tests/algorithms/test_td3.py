@@ -10,13 +10,13 @@ import torch
 from gymnasium.spaces import Box
 from toys import transitions
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams
+from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.config import TD3
 from skillweave.algorithms.td3 import State, TD3Algorithm
-from skillweave.experience import Sample
 from skillweave.networks.config import Network
 from skillweave.ops.losses import critic_loss as regression
-from skillweave.seeding import Seeds
 
 P, B, A = 2, 6, 2
 FORCES = Box(-1, 1, (A,))

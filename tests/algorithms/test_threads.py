@@ -12,12 +12,12 @@ from gymnasium.spaces import Box, Dict, Discrete
 from toys import Echo, learn
 
 from skillweave import Apart, Hierarchy, Skill, TrainDefaults
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import DQN, PPO, SAC, TD3, AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.evolution import Evolution
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.ops.threads import torch_threads
-from skillweave.seeding import Seeds
 
 COUNTS = (1, 2, 4)
 WIDE = Network((64, 64))

@@ -10,10 +10,10 @@ import torch
 from gymnasium.spaces import Box, Discrete
 from torch.distributions import Categorical
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import DQN, PPO, SAC, TD3
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.networks.config import RNN, Network
-from skillweave.seeding import Seeds
 
 P, B, A = 2, 5, 3
 LINE: dict[str, Any] = {"network": Network(()), "normalize_obs": False}

@@ -19,8 +19,8 @@ from benchmarks.four_rooms import (
 )
 from benchmarks.semi_mdp import Option, Process, model_of, optimal, value_of
 from examples.four_rooms import AFTER, CORNER, EAST, G1, G2, NORTH, PLACES, FourRooms
-from skillweave.collecting.acting import Request
-from skillweave.seeding import Seeds
+from skillweave._internal.seeding import Seeds
+from skillweave.experience.acting import Request
 
 EVERYWHERE, NOWHERE = np.ones(3, bool), np.zeros(3, bool)
 

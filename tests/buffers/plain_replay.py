@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import gymnasium as gym
 import numpy as np
 
+from skillweave.algorithms.batches import Batch
 from skillweave.buffers.replay import ReplayStore
-from skillweave.experience import Batch
 
 SPACE = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
 A = 3

@@ -9,10 +9,10 @@ import torch
 from hypothesis import given, settings, strategies as st
 from plain_replay import SPACE, A, World
 
+from skillweave.algorithms.batches import Batch, Sample
 from skillweave.buffers import ram
 from skillweave.buffers.replay import ReplayStore, replay_store
 from skillweave.errors import SkillweaveError
-from skillweave.experience import Batch, Sample
 from skillweave.spaces import action_codec, obs_dtype
 
 GAMMA = torch.tensor([0.9, 0.5, 0.99])

@@ -6,8 +6,8 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
+from skillweave.algorithms.batches import Batch, Rollout
 from skillweave.buffers.rollout import RolloutStore
-from skillweave.experience import Batch, Rollout
 from skillweave.spaces import action_codec, obs_dtype
 
 T, P, B, A, M = 3, 2, 2, 3, 5

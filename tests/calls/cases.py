@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 from reference_calls import EPISODE, POSITION, TAG, Counting, T, Walk, scripted
 
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.collecting.lengths import Lengths
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.policies.hierarchy import ActiveGuide, Interruption
-from skillweave.selectors import Automaton, ready_selector
-from skillweave.skills import Reflex, Skill
+from skillweave.skills import Automaton, Reflex, Skill, ready_selector
+from skillweave.skills.lengths import Lengths
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Array, Memory, Step
 
 # The environment --------------------------------------------------------------------------------

@@ -17,13 +17,13 @@ from calls.users import GAMMA, SEED, USERS, Got, Played, plain
 from hypothesis import HealthCheck, given, settings
 from reference_calls import T, scripted, seeds_of
 
-from skillweave.collecting.calls import SMOOTHED
-from skillweave.collecting.lengths import Lengths
-from skillweave.collecting.skill_set import SkillSet, hierarchy_of
+from skillweave._internal.seeding import Seeds
+from skillweave.experience.calls import SMOOTHED
 from skillweave.policies.core import CallEnd
 from skillweave.policies.hierarchy import unless_none
-from skillweave.seeding import Seeds
 from skillweave.skills import Skill
+from skillweave.skills.lengths import Lengths
+from skillweave.skills.skill_set import SkillSet, hierarchy_of
 from skillweave.types import Array
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import skillweave as sw
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.policies.core import Around, Policy, flat
 from skillweave.policies.parts import Corrects
-from skillweave.selectors import ReadySelector
+from skillweave.skills import ReadySelector
 from skillweave.skills.goal_spaces import with_goal
+from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Memoryless
 
 

@@ -46,8 +46,8 @@ from toys import calling_in
 
 import skillweave as sw
 from skillweave.api.player import Player
-from skillweave.collecting.acting import Acted
-from skillweave.collecting.collector import Collector
+from skillweave.experience.acting import Acted
+from skillweave.experience.collector import Collector
 from skillweave.export.graphs import examples, mask_width
 from skillweave.export.runner import Runner
 from skillweave.export.write import Export, write_export

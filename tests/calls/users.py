@@ -18,12 +18,12 @@ from calls.cases import Case, LevelCase, Worth, guide_of, policy_of, ready, sele
 from reference_calls import seeds_of
 from toys import alone_in, calling_in
 
+from skillweave._internal.seeding import Seeds
 from skillweave.api.player import Player as Deployed
-from skillweave.collecting.acting import Acted, Request
-from skillweave.collecting.collector import Collector
-from skillweave.collecting.levels import UntrainedHierarchy
-from skillweave.collecting.skill_set import acting_policy
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.experience.acting import Acted, Request
+from skillweave.experience.collector import Collector
+from skillweave.experience.levels import UntrainedHierarchy
 from skillweave.export import compile
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
@@ -33,8 +33,8 @@ from skillweave.policies import leaves
 from skillweave.policies.core import Memory, Policy, Turn, World, flat, restart, take
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.policies.spaces import space_of
-from skillweave.seeding import Seeds
 from skillweave.skills import Skill
+from skillweave.skills.skill_set import acting_policy
 from skillweave.training.play import SeededEpisodes, play
 from skillweave.types import Array, Step
 

@@ -9,8 +9,7 @@ from small_runs import interrupt_at_checkpoint
 
 from skillweave.cli import main, sweep
 from skillweave.cli.main import _with_addresses
-from skillweave.cli.sweep import summary
-from skillweave.cli.sweep_code import code_files
+from skillweave.cli.sweep import code_files, summary
 from skillweave.errors import DeclarationError
 from skillweave.recipes import load, source
 from skillweave.runs.directory import RunDirectory

@@ -11,7 +11,7 @@ from skillweave.cli import main, sweep
 
 ray = pytest.importorskip("ray")
 
-from skillweave.collecting import actor_host  # noqa: E402
+from skillweave.workers import actor_host  # noqa: E402
 
 pytestmark = [
     pytest.mark.slow,

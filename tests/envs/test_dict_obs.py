@@ -6,18 +6,18 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 from toys import alone_in, calling_in
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import checksums
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.experience.acting import Acting, Request
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.networks.config import CNN, Network
-from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 from skillweave.spaces import obs_dtype, pack, unpack
 
 ACTIONS = [

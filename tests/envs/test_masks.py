@@ -21,12 +21,12 @@ from skillweave import (
     TrainDefaults,
     evaluate,
 )
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.acting import Acting, Request
 from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import EnvError
-from skillweave.seeding import Seeds
+from skillweave.experience.acting import Acting, Request
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.types import Array
 

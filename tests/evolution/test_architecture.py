@@ -12,12 +12,12 @@ import torch
 from toys import random_critic
 
 from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO
+from skillweave._internal.seeding import Seeds
 from skillweave.errors import DeclarationError
 from skillweave.evolution import Mutations
 from skillweave.evolution.architecture import Change, check_architecture, draw_change, rebuilt
 from skillweave.evolution.stacks import Member, copy, join, split
 from skillweave.ops.optim import adam_
-from skillweave.seeding import Seeds
 
 VECTOR = gym.spaces.Box(-1.0, 1.0, (5,), np.float32)
 IMAGE = gym.spaces.Box(0, 255, (3, 12, 12), np.uint8)

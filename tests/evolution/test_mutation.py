@@ -11,6 +11,8 @@ import pytest
 import torch
 
 from skillweave import CNN, DQN, PPO, SAC, TD3, Network
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.parameters import LARGEST
 from skillweave.errors import DeclarationError
 from skillweave.evolution import Evolution, Mutations, Range
@@ -23,8 +25,6 @@ from skillweave.evolution.mutation import (
     with_settings,
 )
 from skillweave.evolution.stacks import Member, join
-from skillweave.experience import Sample
-from skillweave.seeding import Seeds
 
 OBS = gym.spaces.Box(-1.0, 1.0, (5,), np.float32)
 CHOICE, FORCE = gym.spaces.Discrete(3), gym.spaces.Box(-1.0, 1.0, (2,), np.float32)

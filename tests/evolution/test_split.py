@@ -17,16 +17,16 @@ import torch
 from small_runs import assert_metrics_fit, interrupt_at_checkpoint
 
 from skillweave import DQN, PPO, RNN, Agent, EnvSpec, Network, Ray, SkillweaveError
-from skillweave.collecting.placement import Placement, make_collectors
-from skillweave.collecting.workers import WorkerHost, Workers
+from skillweave._internal.seeding import Seeds
 from skillweave.errors import DeclarationError
 from skillweave.evolution import Evolution, Mutations
 from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
-from skillweave.seeding import Seeds
 from skillweave.training.learning_task import skill_task
 from skillweave.training.role import agent_role
+from skillweave.workers.host import WorkerHost, Workers
+from skillweave.workers.placement import Placement, make_collectors
 
 SMALL = PPO(num_envs=2, n_steps=16, batch_size=16, update_epochs=1, network=Network((8, 6)))
 EVERYTHING = Mutations(0.1, 0.3, 0.2, 0.3, 0.1, units=(4, 16), layers=(1, 3), layer_share=0.5)

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from skillweave import DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Rollout, Sample
 from skillweave.evolution.stacks import Member, crop, join, pad, split, stack_key
-from skillweave.experience import Rollout, Sample
 from skillweave.networks.stacked import Layout
-from skillweave.seeding import Seeds
 
 OBS = gym.spaces.Box(-1.0, 1.0, (5,), np.float32)
 CHOICE, FORCE = gym.spaces.Discrete(3), gym.spaces.Box(-1.0, 1.0, (2,), np.float32)

@@ -27,6 +27,7 @@ from skillweave import (
     SkillweaveError,
     train_agent,
 )
+from skillweave._internal.seeding import Seeds
 from skillweave.errors import DeclarationError
 from skillweave.evolution import (
     Evolution,
@@ -42,7 +43,6 @@ from skillweave.evolution.part import has_diverged
 from skillweave.evolution.population import Population
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.seeding import Seeds
 from skillweave.training.learning_task import skill_task
 from skillweave.training.role import agent_role
 

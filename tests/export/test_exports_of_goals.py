@@ -17,15 +17,15 @@ import skillweave as sw
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.player import Player
-from skillweave.collecting.lengths import Lengths
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import RunError, SkillError
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
-from skillweave.selectors import ready_selector
+from skillweave.skills import ready_selector
 from skillweave.skills.goal_spaces import choice_space, with_goal
 from skillweave.skills.goals import goals_of
+from skillweave.skills.lengths import Lengths
+from skillweave.skills.skill_set import SkillSet
 
 pytest.importorskip("onnxscript")
 torch.set_num_threads(1)

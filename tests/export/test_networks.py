@@ -16,13 +16,13 @@ from torch import nn
 from toys import ASKS, SHOWS
 
 from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network, SkillweaveError
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api.player import Player
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
-from skillweave.seeding import Seeds
 from skillweave.skills.foreign_policy import made_up
 from skillweave.spaces import unpack
 

@@ -14,7 +14,6 @@ from ready_selectors.chain import DOOR, PLACE, Corridor, GetKey, Leave, OpenDoor
 from skillweave import EnvSpec, Lengths
 from skillweave.api.player import Player
 from skillweave.api.policies import load_policy
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import PolicyError, SkillError
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
@@ -33,6 +32,7 @@ from skillweave.policies.core import Turn, World
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 
 
 def opened(step: Any) -> Any:

@@ -37,7 +37,7 @@ from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.policies.hierarchy import ActiveGuide
-from skillweave.selectors import ready_selector
+from skillweave.skills import ready_selector
 from skillweave.skills.foreign_policy import made_up
 from skillweave.types import Array, LastCall, Policy
 

@@ -19,15 +19,14 @@ from toys import skills_of
 from skillweave import PPO, RNN, Automaton, Network, Reflex
 from skillweave.algorithms.config import SkillCritic
 from skillweave.api.player import Player
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import PolicyError
 from skillweave.export import compile
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
-from skillweave.selectors import ready_selector
-from skillweave.skills import Skill, from_onnx, from_torch
+from skillweave.skills import Skill, from_onnx, from_torch, ready_selector
+from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Array, Step
 
 pytest.importorskip("onnxscript")

@@ -12,14 +12,14 @@ from small_runs import goes_on
 from worlds import SMALL, SPACES, Point, Rest, declared, go_to
 
 import skillweave as sw
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.skill_set import SkillSet, hierarchy_of
 from skillweave.policies.core import INTERRUPTED, RUNNING, Policy
 from skillweave.policies.hierarchy import CalledSkill, Hierarchy, Interruption
-from skillweave.seeding import Seeds
 from skillweave.skills.goal_spaces import draw_from, with_goal
 from skillweave.skills.goals import goals_of
+from skillweave.skills.skill_set import SkillSet, hierarchy_of
 from skillweave.types import Step
 
 SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)

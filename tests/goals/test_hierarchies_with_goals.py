@@ -10,9 +10,9 @@ from small_runs import goes_on
 from worlds import SMALL, SPACES, GoTo, Rest, aim_of, declared, go_to
 
 import skillweave as sw
-from skillweave.collecting.collector import Collector
-from skillweave.collecting.learners import Calling
 from skillweave.errors import RunError
+from skillweave.experience.collector import Collector
+from skillweave.experience.learners import Calling
 from skillweave.skills.goal_spaces import with_goal
 
 SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)

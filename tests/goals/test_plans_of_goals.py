@@ -17,7 +17,7 @@ from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.planning import CallLog, Explorer, Mission, Planner, Predicate
 from skillweave.planning.graph import CallGraph
 from skillweave.policies.spaces import space_of
-from skillweave.selectors import LastCall
+from skillweave.skills import LastCall
 from skillweave.skills.goal_spaces import choice_space, draw_from
 from skillweave.skills.goals import goals_of
 

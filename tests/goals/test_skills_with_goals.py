@@ -11,8 +11,8 @@ from toys import alone_in
 from worlds import ON, SMALL, SPACES, Point, Rest, declared, go_to
 
 import skillweave as sw
+from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.seeding import Seeds
 
 often = reports_every(40)
 OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}

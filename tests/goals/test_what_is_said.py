@@ -11,10 +11,10 @@ import torch
 from worlds import ON, SMALL, SPACES, GoTo, Point, Rest, declared, far_corner, go_to
 
 import skillweave as sw
-from skillweave.collecting.judge import JudgedBy
+from skillweave.algorithms.batches import Batch
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
 from skillweave.evolution import Evolution
-from skillweave.experience import Batch
+from skillweave.experience.judge import JudgedBy
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills.goal_spaces import draw_from, shown_goal, with_goal
 from skillweave.skills.goals import Goals, goals_of

@@ -12,12 +12,12 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from reference_calls import EPISODE, POSITION, TAG, Counter, Die, Left, Right, T, Walk, Zigzag
 from toys import cartpole, network_of, skills_of
 
-from skillweave.collecting.skill_set import SkillSet, hierarchy_of
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillError, SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet, hierarchy_of
 from skillweave.types import Step
 
 torch.set_num_threads(1)

@@ -26,12 +26,12 @@ from reference_calls import (
 from toys import skills_of
 
 from skillweave.api import Hierarchy, Run
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.skills import Reflex, Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 from skillweave.training.evaluation import evaluate
 from skillweave.training.play import SeededEpisodes, play
 from skillweave.types import Array, Step

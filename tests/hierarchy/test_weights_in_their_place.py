@@ -12,11 +12,11 @@ import torch
 from declaring import plainly
 
 from skillweave import DQN, PPO, Hierarchy, Network, Skill, SkillweaveError
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import make_algorithm, state_from
 from skillweave.cli import main
-from skillweave.compat.agent_files import load_agent, save_agent
+from skillweave.compat.single_agent import load_agent, save_agent
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
-from skillweave.seeding import Seeds
 
 SMALL = PPO(num_envs=2, n_steps=8, batch_size=16, network=Network((4,)), overlap=False)
 NAMES = "left", "right", "stay"

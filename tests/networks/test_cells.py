@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from skillweave import PPO, Network
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import register_encoder
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.errors import DeclarationError
@@ -16,7 +17,6 @@ from skillweave.networks.encoders import (
     CellsEncoder,
     sum_of_rows,
 )
-from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
 
 GRID = gym.spaces.Box(0, 255, (3, 3, 2), np.uint8)

@@ -10,9 +10,9 @@ from torch.distributions import (
     TransformedDistribution,
 )
 
+from skillweave._internal.seeding import Seeds
 from skillweave.networks.heads import LOG_STD, ActionHead
 from skillweave.ops.distributions import clamp_inward
-from skillweave.seeding import Seeds
 from skillweave.spaces import action_codec
 
 P, B = 2, 5

@@ -11,6 +11,7 @@ from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from torch.nn import functional as F
 from toys import drawn
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import (
     DQN,
     PPO,
@@ -26,7 +27,6 @@ from skillweave.networks.config import CNN, RNN, Network
 from skillweave.networks.net import Net, seen_places
 from skillweave.networks.qnet import QNet
 from skillweave.networks.stacked import Layout
-from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
 
 P, B, A = 2, 4, 3

@@ -22,20 +22,21 @@ from torch import nn
 from toys import Echo, drawn, learn
 
 import skillweave as sw
-from skillweave import DQN, PPO, RNN, SAC, TD3, Hierarchy, Network, SkillweaveError, named as naming
+from skillweave import DQN, PPO, RNN, SAC, TD3, Hierarchy, Network, SkillweaveError
+from skillweave._internal import named as naming
+from skillweave._internal.named import Named, named
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.shipping import packed, unpacked
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution import Evolution, Mutations
-from skillweave.named import Named, named
 from skillweave.networks.encoders import make_encoder
 from skillweave.networks.own import ModuleEncoder
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import read_manifest
-from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.spaces.packing import pack
+from skillweave.workers.shipping import packed, unpacked
 
 P, B = 3, 5
 
@@ -281,7 +282,7 @@ def test_it_is_known_where_its_settings_are_unpacked(tmp_path):
         packed((policy, policy.to_file(), obs, policy.act({}, obs)[0]), "it")
     )
     code = (
-        "from skillweave.collecting.shipping import unpacked\n"
+        "from skillweave.workers.shipping import unpacked\n"
         "from skillweave.algorithms.policy import AgentPolicy\n"
         f"policy, file, obs, want = unpacked(open({str(tmp_path / 'sent')!r}, 'rb').read())\n"
         "again = AgentPolicy.from_file(*file, 'it')\n"

@@ -413,7 +413,7 @@ def test_calls_are_logged(tmp_path):
 
 
 def test_rows_of_a_part_cannot_be_judged_again():
-    from skillweave.collecting.judge import judged_by
+    from skillweave.experience.judge import judged_by
 
     with pytest.raises(DeclarationError, match=r"skill 'arm'.*leave out sees"):
         judged_by(Arm(), on())

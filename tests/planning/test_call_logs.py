@@ -26,7 +26,6 @@ from ready_selectors.chain import (
 from toys import skills_of
 
 from skillweave import Automaton, EnvSpec, Lengths
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, EnvError, RunError
 from skillweave.planning import CallLog, join, record_calls
 from skillweave.planning.columns import columns_of
@@ -34,6 +33,7 @@ from skillweave.policies.core import CallEnd
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 
 SKILLS = (GetKey(), OpenDoor(), Leave(), Wait())
 

@@ -23,13 +23,13 @@ from ready_selectors.chain import (
 from toys import skills_of
 
 from skillweave import Automaton, EnvSpec, Lengths
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, EnvError
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.planning import CallLog, record_calls
 from skillweave.planning.columns import columns_of
 from skillweave.policies.core import CallEnd
 from skillweave.skills import Skill
+from skillweave.skills.skill_set import SkillSet
 from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.types import Array, Step
 

@@ -17,8 +17,7 @@ from skillweave.planning import (
     in_any_order,
     successes,
 )
-from skillweave.selectors import LastCall
-from skillweave.skills import Skill
+from skillweave.skills import LastCall, Skill
 
 A, B, C = (column(i) for i in range(3))
 

@@ -25,7 +25,6 @@ from ready_selectors.chain import (
 from toys import skills_of
 
 from skillweave import EnvSpec, Hierarchy, Lengths, evaluate
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.planning import (
     CallLog,
@@ -43,9 +42,9 @@ from skillweave.planning.graph import LEVELS, exact_states, planning_states
 from skillweave.planning.neighbors import nearest, tie_order
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import nearest_corner
-from skillweave.selectors import LastCall
-from skillweave.skills import Skill
+from skillweave.skills import LastCall, Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Array, HierarchyPolicy
 
 GAMMA = 0.9

@@ -31,7 +31,6 @@ from ready_selectors.chain import (
 
 import skillweave as sw
 from skillweave.api import Run
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, EnvError, SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.networks.config import RNN, Network
@@ -39,9 +38,9 @@ from skillweave.planning import CallLog, GoalTask, Mission, Planner, held
 from skillweave.planning.mission import as_task
 from skillweave.planning.task_env import OwnView, Tasked
 from skillweave.policies.core import CallEnd
-from skillweave.selectors import LastCall
-from skillweave.skills import ready_policy
+from skillweave.skills import LastCall, ready_policy
 from skillweave.skills.foreign_policy import fitted, made_up
+from skillweave.skills.skill_set import SkillSet
 
 QUICK: dict[str, Any] = {"num_envs": 4, "n_steps": 32, "batch_size": 32, "update_epochs": 2}
 

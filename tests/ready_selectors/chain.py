@@ -7,12 +7,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.selectors import ready_selector
-from skillweave.skills import Skill
+from skillweave.skills import Skill, ready_selector
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Array, Step
 
 PLACE, KEY, DOOR = range(3)

@@ -12,7 +12,7 @@ import skillweave as sw
 from skillweave import Automaton
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.policies.core import CallEnd
-from skillweave.selectors import LastCall
+from skillweave.skills import LastCall
 from skillweave.types import Step
 
 STATES = {"search": "get_key", "unlock": "open_door", "free": "leave"}

@@ -12,9 +12,8 @@ from ready_selectors.chain import Corridor, has_key, hierarchy, story
 from skillweave import tree
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.policies.core import CallEnd
-from skillweave.selectors import LastCall
-from skillweave.selectors.ready import ready_selector
-from skillweave.selectors.tree_policy import TreeSelector
+from skillweave.skills import LastCall
+from skillweave.skills.ready_selector import TreeSelector, ready_selector
 
 ABC = ("a", "b", "c")
 S, F = True, False

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from skillweave import recipes
-from skillweave.collecting import shipping
-from skillweave.collecting.shipping import packed
 from skillweave.errors import DeclarationError
 from skillweave.types import Step
+from skillweave.workers import shipping
+from skillweave.workers.shipping import packed
 
 RECIPE = """
 from skillweave import Hierarchy, Skill, PPO
@@ -78,7 +78,7 @@ def test_what_is_imported_later_is_found_in_another_process_too(
     file.write_bytes(packed(recipes.load(recipe), "it"))
     code = (
         "from types import SimpleNamespace as S; import numpy as np\n"
-        "from skillweave.collecting.shipping import unpacked\n"
+        "from skillweave.workers.shipping import unpacked\n"
         f"own = unpacked(open({str(file)!r}, 'rb').read())\n"
         "print(own.skills[0].reward(S(next_obs=np.zeros((1, 4)))))\n"
     )

@@ -19,6 +19,7 @@ import torch
 from small_runs import level_entry, small_manifest
 from torch import Tensor
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import PPO, config_to_json
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy, make_algorithm
 from skillweave.errors import RunError, SkillweaveError
@@ -36,7 +37,6 @@ from skillweave.runs.manifest import (
     StageEntry,
     versions,
 )
-from skillweave.seeding import Seeds
 
 ALGORITHM = json.loads(json.dumps(config_to_json(PPO())))
 

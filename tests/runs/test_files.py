@@ -428,22 +428,22 @@ def test_nothing_in_the_library_pickles_or_runs_text_as_code() -> None:
     source = (LIBRARY / "compat/pickles.py").read_text()
     assert re.findall(r"\bpickle\.\w+", source) == ["pickle.Unpickler"]
     # The one that sends the user's own code to processes of the same user, as multiprocessing does:
-    # no file is ever read by it, and only these send and receive (``sweep_code`` asks it which
+    # no file is ever read by it, and only these send and receive (``sweep`` asks it which
     # modules are the user's own, ``recipe_file`` names a recipe's folder, and
     # ``start_methods`` asks what another process would import).
-    assert len(found.pop("collecting/shipping.py")) == 2
-    sender = (LIBRARY / "collecting/shipping.py").read_text()
+    assert len(found.pop("workers/shipping.py")) == 2
+    sender = (LIBRARY / "workers/shipping.py").read_text()
     assert not re.search(r"\bopen\(|\.read|\.load\(", sender)
-    users = {str(p.relative_to(LIBRARY)) for p in modules if "collecting.shipping" in p.read_text()}
+    users = {str(p.relative_to(LIBRARY)) for p in modules if "workers.shipping" in p.read_text()}
     senders = {
         "cli/sweep.py",
-        *(f"collecting/{n}.py" for n in ("actors", "processes", "actor_host")),
+        *(f"workers/{n}.py" for n in ("actors", "processes", "actor_host")),
     }
-    others = {"api/recipe_file.py", "cli/sweep_code.py", "collecting/start_methods.py"}
+    others = {"api/recipe_file.py", "cli/sweep.py", "workers/start_methods.py"}
     assert users == senders | others
     # Messages between a run and its own workers, through pipes that only they have.
-    assert len(found.pop("collecting/channel.py")) == 1
-    channel = (LIBRARY / "collecting/channel.py").read_text()
+    assert len(found.pop("workers/channel.py")) == 1
+    channel = (LIBRARY / "workers/channel.py").read_text()
     assert not re.search(r"\bopen\(|\.load\(", channel)
     # What acts stands alone, and reads the arrays of exports: NumPy refuses objects in them.
     (line,) = found.pop("policies/codec.py")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from reference_calls import Walk
 
-from skillweave.collecting.judge import judged_by
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, SkillError
+from skillweave.experience.judge import judged_by
 from skillweave.skills import Reflex, Skill, asked
 from skillweave.types import Step
 

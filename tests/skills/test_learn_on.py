@@ -6,9 +6,9 @@ import pytest
 import torch
 
 import skillweave as sw
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.seeding import Seeds
 
 sb3 = pytest.importorskip("stable_baselines3")
 

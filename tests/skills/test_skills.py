@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
+from skillweave._internal.messages import short
 from skillweave.errors import SkillweaveError
-from skillweave.messages import short
 from skillweave.policies.core import Policy
 from skillweave.policies.parts import Reflexes
 from skillweave.policies.spaces import space_of

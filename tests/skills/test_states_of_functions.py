@@ -14,13 +14,12 @@ from gymnasium.spaces import Box, Discrete
 from test_asked_twice import step
 
 from skillweave import tree
+from skillweave._internal.notices import collected_notices
 from skillweave.errors import PolicyError
-from skillweave.notices import collected_notices
 from skillweave.planning import GoalTask, Predicate, RewardMachine
 from skillweave.policies.core import LastCall
 from skillweave.policies.spaces import space_of
-from skillweave.selectors import Automaton, ready_selector
-from skillweave.skills import Reflex, Skill, asked, from_function
+from skillweave.skills import Automaton, Reflex, Skill, asked, from_function, ready_selector
 from skillweave.skills.foreign_policy import check_spaces
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.skills.goals import Goals
@@ -111,13 +110,13 @@ def places() -> dict[str, list[Callable[[], Any]]]:
     return {
         "planning.goal": [lambda: task.holds(OBS, OBS)],
         "planning.predicates": [lambda: inverse.at(OBS)],
-        "selectors.base": [
+        "skills.selector": [
             chooses(Automaton({"x": "a", "y": "b"}, {("x", "y"): Best()})),
             chooses(tree.Fallback(tree.Sequence(Best(), "a"), "b")),
             lambda: with_goals.act({"state": np.zeros(4, int)}, OBS),
             lambda: machine.acts.read(step()),
         ],
-        "selectors.ready": [chooses(Best()), chooses(Two())],
+        "skills.ready_selector": [chooses(Best()), chooses(Two())],
         "skills.base": [
             lambda: condition.holds(OBS),
             lambda: reflex.apply(OBS, np.zeros(4, int), space_of(SPACES[1])),

@@ -13,11 +13,11 @@ from toys import network_of
 
 from skillweave import EnvSpec, Skill, SkillweaveError, envpool, evaluate
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs import checks
 from skillweave.errors import PolicyError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 from skillweave.training.evaluation import FIRST_SEED, interquartile_mean
 from skillweave.types import Evaluation
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from skillweave import Together
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.batches import Batch
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.experience import Batch
-from skillweave.seeding import Seeds
-from skillweave.training.joint_learner import JointLearner, how_it_acted
+from skillweave.training.joint import JointLearner, how_it_acted
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.types import Array
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import skillweave as sw
-from skillweave.seeding import Seeds
+from skillweave._internal.seeding import Seeds
 from skillweave.training import imitation
 
 

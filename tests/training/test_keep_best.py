@@ -34,13 +34,13 @@ from skillweave import (
     TrainDefaults,
     train_agent,
 )
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.evolution import Evolution
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.runs.manifest import Best
-from skillweave.seeding import Seeds
 from skillweave.training.keep_best import KeepBest
 
 SYNC = EnvSpec("CartPole-v1", engine="sync", workers=1)

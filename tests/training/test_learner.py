@@ -22,14 +22,14 @@ from toys import (
     training,
 )
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import DQN, SAC, TD3
 from skillweave.algorithms.dqn import DQNAlgorithm
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.acting import Acting
-from skillweave.collecting.group import Collectors
 from skillweave.errors import SkillweaveError
+from skillweave.experience.acting import Acting
+from skillweave.experience.group import Collectors
 from skillweave.networks.config import Network
-from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack, crossed
 from skillweave.training.loop import Progress, Saved, train

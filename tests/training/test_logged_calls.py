@@ -17,7 +17,6 @@ from small_runs import (
 )
 
 from skillweave import EnvSpec, Hierarchy, Lengths, Ray, Run, Skill, TrainDefaults
-from skillweave.collecting import placement
 from skillweave.errors import DeclarationError, EnvError, Interrupted, RunError
 from skillweave.evolution import Evolution
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -26,6 +25,7 @@ from skillweave.planning.calls import LEARNING
 from skillweave.planning.columns import columns_of
 from skillweave.policies.core import CallEnd
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.workers import placement
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 

@@ -26,22 +26,22 @@ from toys import (
     training,
 )
 
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import DQN, PPO
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm, State
-from skillweave.collecting.acting import Acting
-from skillweave.collecting.group import Collectors
-from skillweave.collecting.processes import ProcessCollectors
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError, TrainingError
+from skillweave.experience.acting import Acting
+from skillweave.experience.group import Collectors
 from skillweave.networks.config import RNN, Network
-from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack
 from skillweave.training.learning_task import skill_task
 from skillweave.training.loop import Progress, Saved
 from skillweave.training.replay_learner import learner_of
 from skillweave.training.role import agent_role
+from skillweave.workers.processes import ProcessCollectors
 
 CONFIG = PPO(
     num_envs=16, n_steps=16, batch_size=64, update_epochs=4, learning_rate=5e-3, gamma=0.9,

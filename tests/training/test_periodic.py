@@ -20,12 +20,12 @@ from skillweave import (
     Skill,
     TrainDefaults,
 )
+from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.collector import RETURN
 from skillweave.envs import checks
+from skillweave.experience.collector import RETURN
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
-from skillweave.seeding import Seeds
 from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 
 SMALL = Network((8,), "relu")

@@ -24,9 +24,9 @@ from reference_calls import (
 from toys import skills_of
 
 from skillweave import EnvSpec, Skill, evaluate
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.skill_set import SkillSet
 from skillweave.training.evaluation import FIRST_SEED
 from skillweave.training.skill_report import (
     SkillReport,

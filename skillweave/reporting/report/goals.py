@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.paths import join
+from skillweave._internal.paths import join
 from skillweave.planning import CallLog
 from skillweave.reporting.report import charts
 from skillweave.reporting.report.facts import percent

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from skillweave._internal.messages import short
+from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.envs.engine import RawStep
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import EnvError, SkillweaveError
-from skillweave.messages import short
 from skillweave.planning import CallLog, Handover
 from skillweave.planning.handover import before_each
 from skillweave.planning.neighbors import evenly
@@ -27,7 +28,6 @@ from skillweave.reporting.report.calls import (
 from skillweave.reporting.report.facts import WHY, WORDS, number, percent, scale_of, span
 from skillweave.reporting.report.film import HOLD, Film, Shot, make_film
 from skillweave.reporting.report.page import Section
-from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.goals import goals_of

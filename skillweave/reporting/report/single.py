@@ -9,10 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from skillweave._internal.paths import AGENT
+from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import SkillweaveError
-from skillweave.paths import AGENT
 from skillweave.planning.columns import ENDS
 from skillweave.planning.handover import wilson
 from skillweave.planning.run_log import load_calls
@@ -54,7 +55,6 @@ from skillweave.reporting.report.verdict import is_binary, no_verdict, solved, v
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.schema import AtLeastOne, Count, fitted
-from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate

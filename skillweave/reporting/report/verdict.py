@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from skillweave.paths import level_of
+from skillweave._internal.paths import level_of
 from skillweave.planning.handover import wilson
 from skillweave.reporting.report.facts import number, percent, scale_of, span
 from skillweave.runs.manifest import StageEntry

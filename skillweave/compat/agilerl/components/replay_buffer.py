@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.algorithms.batches import Sample
 from skillweave.compat.agilerl.agent import random_seed
 from skillweave.compat.transition_buffer import TransitionBuffer
-from skillweave.experience import Sample
 from skillweave.types import Array
 
 

@@ -5,10 +5,10 @@ from typing import Any
 
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from skillweave._internal.messages import suggest
 from skillweave.compat.agilerl.agents import DDPG, DQN, PPO, TD3, RainbowDQN
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
-from skillweave.messages import suggest
 
 _KINDS: dict[str, Any] = {kind.algo: kind for kind in (PPO, DQN, RainbowDQN, DDPG, TD3)}
 

@@ -1,0 +1,5 @@
+"""What all rooms use and no user sees: messages, checks of arguments, paths, seeds, signals.
+
+Begin with ``messages``, which has the parts of sentences, and ``paths``, which names the parts of a
+hierarchy.
+"""

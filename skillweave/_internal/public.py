@@ -1,0 +1,96 @@
+"""Public names: where users import each one, and which module has it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from importlib import import_module
+from typing import Any
+
+PUBLIC = {
+    "skillweave": {
+        "algorithms.config": "DQN PPO SAC SelfImitationPPO TD3",
+        "algorithms.schedules": "Linear",
+        "api": "Agent Hierarchy Run train_agent",
+        "api.loading": "from_hub load",
+        "api.options": "make_options_env",
+        "api.player": "Player",
+        "api.policies": "load_policy save_policy",
+        "workers.cluster": "Ray",
+        "skills.lengths": "Lengths",
+        "envs.make": "EnvSpec",
+        "envs.pool": "envpool",
+        "errors": "SkillweaveError",
+        "hierarchy.settings": "Apart Guide Selection",
+        "networks.config": "CNN Network RNN",
+        "reporting.curves_figure": "plot_curves",
+        "skills": "Reflex Residual Skill from_function from_onnx from_sb3 from_torch tree",
+        "skills.automaton": "Automaton",
+        "skills.mapping": "Acts Goal LastAction Part",
+        "training.defaults": "TrainDefaults",
+        "training.evaluation": "evaluate",
+        "training.stage": "Together",
+        "types": "Step",
+    },
+    "skillweave.algorithms": {
+        "algorithms.base": "ActingParams AgentState Algorithm",
+        "algorithms.config": "OnPolicy",
+        "algorithms.parameters": "ParameterGroup",
+        "algorithms.registry": "register_algorithm",
+        "algorithms.batches": "Report Rollout Sample",
+        "networks.encoders": "Encoder register_encoder",
+        "networks.heads": "ActionHead",
+        "networks.net": "Net",
+        "networks.stacked": "Layout",
+        "ops.distributions": "mask_logits",
+        "ops.moments": "masked_mean normalize",
+        "ops.optim": "adam_ clip_grad_norm_",
+        "ops.returns": "gae",
+    },
+    "skillweave.envs": {
+        "envs.pool": "PoolWrapper one_of",
+        "hierarchy.options": "OptionsEnv",
+    },
+    "skillweave.errors": {
+        "errors": "EnvError Interrupted MissingExtra TrainingError",
+        "policies.errors": "DeclarationError PolicyError RunError SkillError",
+    },
+    "skillweave.evolution": {
+        "evolution.config": "Evolution Mutations Range Tournament Truncation",
+        "evolution.selection": "Heir ParentSelection",
+    },
+    "skillweave.types": {
+        "export.write": "Export",
+        "hierarchy.policy": "HierarchyPolicy",
+        "policies.core": "Array LastCall",
+        "_internal.seeding": "Seeds",
+        "training.callback": "TrainEvent",
+        "training.evaluation": "Evaluation",
+        "types": "Policy",
+    },
+}
+"""By module that users import from: the names of each module of the library."""
+
+HOMES = {
+    module: {name: home for home, names in homes.items() for name in names.split()}
+    for module, homes in PUBLIC.items()
+}
+"""The same, by module and name."""
+
+
+def lazy(module: str) -> tuple[list[str], Callable[[str], Any], Callable[[], Iterable[str]]]:
+    """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a module that users import from.
+
+    Names are imported when first used: torch takes two seconds, which ``--help`` must not pay.
+    """
+    homes = HOMES[module]
+
+    def get(name: str) -> Any:
+        if name in homes:
+            return getattr(import_module(f"skillweave.{homes[name]}"), name)
+        from difflib import get_close_matches
+
+        hints = [f": it is in {other}" for other, names in HOMES.items() if name in names]
+        hints += [f": is {near!r} meant?" for near in get_close_matches(name, homes, n=1)]
+        raise AttributeError(f"module {module!r} has no attribute {name!r}{''.join(hints[:1])}")
+
+    return sorted(homes), get, homes.keys

@@ -1,1 +1,0 @@
-"""Collectors, which step environments, and the calls of skills in them."""

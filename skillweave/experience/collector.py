@@ -1,0 +1,560 @@
+"""The collector: N environments, who acts in them, and their open episodes between requests."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from skillweave._internal.seeding import Seeds, seed_global_generators
+from skillweave.algorithms.batches import INFO, Batch, Trace, padded_last_axis, side_by_side
+from skillweave.envs.engine import Engine, RawStep, checksums
+from skillweave.envs.infos import info_numbers, reported_success
+from skillweave.errors import DeclarationError, RunError
+from skillweave.experience.acting import Acting, Request
+from skillweave.experience.judge import judge, seen_by
+from skillweave.experience.learners import Alone, Calling, LevelLearners, OneLearner
+from skillweave.experience.restored import OF_LEARNERS, check_numbers, opened
+from skillweave.experience.search import Search
+from skillweave.experience.views import steps_of, successes_of
+from skillweave.experience.writer import TraceWriter
+from skillweave.policies.core import (
+    LIMIT,
+    OWN,
+    Turn,
+    World,
+    end_with_episode,
+    flat,
+    part_of,
+    restart,
+)
+from skillweave.policies.spaces import Space, space_of
+from skillweave.skills.goals import goals_of
+from skillweave.skills.info_words import info_keys
+from skillweave.types import Array, Step, prefixed, unprefixed
+
+RETURN, TASK_RETURN, LENGTH, SUCCESS = range(4)
+"""The first columns of ``Collected.episodes``."""
+FIRST_INFO = 4
+"""The column of the first logged key of ``info``; those of the others follow."""
+PLAYED = 64
+"""Steps after which episodes that are played are judged."""
+
+
+@dataclass
+class Collected:
+    """The answer to a request: what learners learn from, and numbers for people."""
+
+    batches: dict[str, Batch]
+    """By path, what each learner did; \"\" where there is one."""
+    steps: int
+    """Environment steps that were made for it, those of rows that are not valid included."""
+    episodes: Array  # (K, 4 + I) float64, those that ended; NaN where there is no such number
+    stands: Array | None = None  # (N,) checksums of what the environments show now; of workers
+    begun_anew: Array = field(default_factory=lambda: np.empty(0, np.int64))
+    """(k,) environments whose first row here does not follow from their last row before."""
+    info_keys: frozenset[str] = frozenset()
+    """Keys of ``info`` where episodes ended without a key that is logged."""
+    calls: Batch | None = None
+    """The steps with what calls did in them, for a log of calls; None: none is kept."""
+    longest: int = 0
+    """Steps of the longest open episode, where no time limit is known."""
+
+
+class Collector:
+    """N environments, and who acts in them. A function of requests, seeds and ``state``.
+
+    A skill that has goals gets one where a call of it starts, by ``Skill.goals``, until it ends.
+    A checkpoint ends no episode: ``state`` holds what is needed to play the open ones again.
+
+    Args:
+        engine: the environments; they are reset by ``start``, or stand where ``restore`` puts them.
+        acting: the plain agent, the skill, or the selectors that learn; None: the guide decides, or
+            only ``like`` is to act.
+        who: acts.
+        learners: by path, all others who learn: ``skill``, ``inner/skill``, ``inner/selector``;
+            ``skill_critic`` and ``inner/skill_critic`` say what skills are worth. None: one alone
+            learns, at the path ""; else a selector has the path ``selector``.
+        margins: by the paths of critics: calls end where a new decision is worth this much more.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        acting: Acting | None,
+        who: Alone | Calling,
+        learners: Mapping[str, Acting] | None = None,
+        margins: Mapping[str, float] | None = None,
+    ) -> None:
+        self.engine, self.num_envs = engine, engine.num_envs
+        n = self.num_envs
+        self.acting, self.who, self.skill = acting, who, who.skill
+        self.learners, self._together = learners or {}, learners is not None
+        self._goals = goals_of(self.skill)
+        self.obs: Array = np.empty(0)
+        """(N, *obs_shape), what to act on next."""
+        self.open: dict[str, Array] = {}
+        """What is kept of open calls, (N, …) each, whose shape is known when one begins."""
+        self.search: Search | None = None
+        """What leads to where a skill may start; None: it starts wherever episodes do."""
+        self.limit = None if self.skill is None else self.skill.max_steps
+        """The most steps of a call of the skill; None: any number."""
+        self.learning: OneLearner | LevelLearners
+        if isinstance(who, Alone):
+            self.learning = OneLearner(who, engine, acting)
+            self.search = who.starts.search(who.skill, engine)
+            self.limit = who.limit or self.limit
+        else:
+            self.learning = LevelLearners(who, engine, acting, learners, margins, self.open)
+        self.policy, self.memory = self.learning.policy, self.learning.memory
+        self.kept: dict[str, Array] = {
+            "age": np.zeros(n, np.int64),  # steps of the open episode
+            "sums": np.zeros((n, 3)),  # of it: return, return of the task, length as the skill's
+            **flat(self.memory, "player."),
+            **self.learning.kept,
+        }
+        """What is kept of each environment, (N, …) each; changed in place."""
+        self.values = prefixed("player", self.policy.values()) | self.learning.values
+        """By names of these, what numbers that choose among something may be, or whose goals."""
+        self.after_request = {"sums", *self.learning.kept}
+        """Names in ``kept`` that change when the steps of a request are judged, not in a step."""
+        if self._goals is not None:
+            self.kept["goal"] = self._goals.start(n)
+            self.values["goal"] = self._goals
+            self.kept["needs_goal"] = np.ones(n, bool)  # a call starts
+        if self.search is not None:
+            self.kept |= self.search.kept
+            self.values |= self.search.values
+        self._last_actions: Space | None = None  # of the actions, where the last one counts
+        if self.policy.holds or (self.search is not None and self.search.holds):
+            self._last_actions = space_of(engine.action_space)
+            self.kept["last_action"] = self._last_actions.start(n)
+        self.overridden = np.zeros(n, bool) if self.learning.overrides else None
+        """(N,), where reflexes acted in the latest step; None: not recorded."""
+        ends = self.skill is not None and self.skill.defines("termination")
+        self._asks = self.policy.watches or self.search is not None or ends
+        """Something is asked about each step while it is made."""
+        self.begun = False
+        self._all = np.arange(n)
+        self.log_info: tuple[str, ...] = ()
+        """I keys of ``info`` whose values at the ends of episodes are logged."""
+        self.log_calls: tuple[str, ...] | None = None
+        """Keys of ``info`` in the log of calls; None: none is kept."""
+        self._info_keys: set[str] = set()
+        self._ended: list[tuple[int, Array, Array]] = []
+        """Of episodes that ended in a request: row, environments, and numbers without sums."""
+
+    def like(self, engine: Engine, acting: Acting) -> Collector:
+        """Return a collector of the same kind over other environments."""
+        if self._together:
+            raise DeclarationError("hierarchies that learn as a whole do not evolve")
+        return Collector(engine, acting, self.who)
+
+    @property
+    def elapsed(self) -> Array:
+        """(N,) steps of the calls of the skill that acts, or of the episodes."""
+        return self.kept["age" if self.search is None else "elapsed"]
+
+    def start(self, seeds: Seeds) -> None:
+        """Start every environment, unless they have started."""
+        if not self.begun:
+            self.obs = np.array(self.engine.reset((seeds / "env").integer()))
+            self._clear(self._all)
+            self._forget(self._all)
+            self.begun = True
+
+    def collect(self, request: Request) -> Collected:
+        """``request.rows`` steps of each environment."""
+        before, self._info_keys, self._ended = self.engine.steps_made, set(), []
+        self._prepare(request)
+        writer = self._writer(request.rows)
+        for _ in range(request.rows):
+            self._step(writer)
+        self._world.trace = None  # only learners hold it from here on
+        trace = writer.trace()
+        judged, found = self._judge(trace)
+        batches = self._views(trace, judged)
+        steps = self.engine.steps_made - before
+        episodes = np.concatenate(
+            [np.zeros((0, FIRST_INFO + len(self.log_info))), *(x for _, _, x in found)]
+        )
+        limited = self.engine.time_limit is not None
+        longest = 0 if limited else int(self.kept["age"].max())
+        keys = frozenset(self._info_keys)
+        calls = None
+        if self.log_calls is not None and isinstance(self.learning, LevelLearners):
+            calls = self.learning.log(trace, self.log_calls)
+        return Collected(batches, steps, episodes, info_keys=keys, longest=longest, calls=calls)
+
+    def play(self, request: Request, seeds: Seeds, max_steps: int) -> Array:
+        """Play one episode in each environment, from its start.
+
+        Args:
+            request: who acts; ``rows`` does not count.
+            max_steps: steps after which an episode is cut.
+
+        Returns:
+            (N, 4 + I), as ``Collected.episodes``; NaN where none could begin.
+        """
+        self.begun = False
+        self.start(seeds)
+        found = np.full((self.num_envs, FIRST_INFO + len(self.log_info)), np.nan)
+        playing, unknown = np.ones(self.num_envs, bool), np.ones(self.num_envs, bool)
+        self._prepare(request)
+        steps, self._ended = 0, []
+        while steps < max_steps and playing.any():
+            writer = self._writer(min(PLAYED, max_steps - steps))
+            while writer.row < min(PLAYED, max_steps - steps) and playing.any():
+                self._step(writer)
+                for _, ids, _ in self._ended[-1:]:
+                    playing[ids] = False
+                if self.search is not None:
+                    playing &= ~self.search.given_up
+            steps += writer.row
+            for _, ids, episodes in self._judge(writer.trace())[1]:
+                first = unknown[ids]
+                found[ids[first]], unknown[ids[first]] = episodes[first], False
+        found[playing, :3] = self.kept["sums"][playing]
+        return found
+
+    def state(self) -> dict[str, Array]:
+        """Return what ``restore`` needs. It changes nothing."""
+        kept = {k: as_numbers(v).copy() for k, v in self.kept.items()}
+        kept["obs"] = checksums(self.obs)
+        opened = {k: v.copy() for k, v in self.open.items()}
+        found = prefixed("kept", kept) | prefixed("open", opened)
+        return found | prefixed("engine", self.engine.state())
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Restore the open episodes of ``state``: play them again.
+
+        Returns:
+            (k,) environments that start again, as they did not repeat themselves.
+
+        Raises:
+            RunError: the state is another collector's.
+        """
+        # Environments that draw from global generators go on otherwise than they began.
+        seed_global_generators(Seeds(_checksum(state)) / "global")
+        kept = unprefixed("kept", state)
+        if others := sorted(kept.keys() ^ {*self.kept, "obs"}):
+            raise RunError(
+                f"the checkpoint's open episodes differ in {others[0]!r}: it is of another stage "
+                "or another version of Skillweave, or damaged"
+            )
+        for name, values in self.kept.items():
+            found, own = kept[name], as_numbers(values)
+            if found.shape != own.shape or found.dtype != own.dtype:
+                raise RunError(
+                    f"the checkpoint's {name!r} of open episodes is {found.dtype} {found.shape}, "
+                    f"where {own.dtype} {own.shape} belongs: it is not of this stage, or damaged"
+                )
+            own[:] = found
+        check_numbers(self.kept, self.values)
+        obs, early = self.engine.restore(unprefixed("engine", state))
+        self.obs, self.begun = np.array(obs), True
+        space = self.engine.observation_space
+        self.open.clear()
+        saved = unprefixed("open", state)
+        self.open |= opened(saved, self.kept, self.obs, space, self.learning.seen_goals)
+        other = np.flatnonzero(checksums(self.obs) != kept["obs"])
+        ids = np.union1d(early, other)
+        self._clear(ids)
+        return self._begin_anew(ids)
+
+    def close(self) -> None:
+        """Release the environments."""
+        self.engine.close()
+
+    # Steps are made -----------------------------------------------------------------------------
+
+    def _prepare(self, request: Request) -> None:
+        """Act by this request from now on."""
+        self.learning.begin(request, self.elapsed)
+        self._record, self._greedy = request.record, request.greedy
+        self._goal_rng = (request.seeds / "goals").numpy()
+        rng, last = (request.seeds / "skills").numpy(), self.kept.get("last_action")
+        self._world = World(rng, self.kept["age"], last, self.overridden)
+
+    def _writer(self, rows: int) -> TraceWriter:
+        """Return what writes the trace of ``rows`` steps."""
+        skill = self.skill
+        reads = skill is not None and any(map(skill.defines, skill.methods))
+        reads |= any(name.startswith(INFO) for name in self._record) or self.learning.reads_infos()
+        if self.log_calls is not None and isinstance(self.who, Calling):
+            reads |= bool(self.log_calls)
+            reads |= any(s.defines("success") for s in self.who.skills.skills)
+        self._world.trace = writer = TraceWriter(rows, self.num_envs, keep_infos=reads)
+        return writer
+
+    def _step(self, out: TraceWriter) -> None:
+        """Step every environment, and write what happened."""
+        obs, mask, rows, waiting = self.obs, self.engine.mask(), self._all, self._all[:0]
+        if self.search is not None:
+            rows, waiting = self.search.playing(obs, self._world)
+        if self.overridden is not None:
+            self.overridden[:] = False
+        goal = self._goal(rows)
+        turn = Turn(self._world, mask, goal, self._greedy)
+        if len(waiting):
+            action = self._searched(rows, waiting, turn)
+            out.write(waiting, valid=np.zeros(len(waiting), bool))
+        else:
+            action = self.policy.act(self.memory, rows, obs, turn)
+        whole = self.learning.whole or self.log_calls is not None
+        if whole:  # else only where a selector decides and calls end
+            out.write(obs=obs, env_action=action, mask=mask, goal=goal, overridden=self.overridden)
+        raw = self.engine.step(action)
+        self.kept["age"] += 1
+        if self.search is not None:
+            self.elapsed[rows] += 1
+        if self._last_actions is not None:
+            self.kept["last_action"][:] = action
+        step = raw.seen(obs, action, self.kept["age"].copy()) if self._asks else None
+        end = self._ends(raw, step, rows, goal)
+        self.learning.write(out, end, whole)
+        out.write(
+            elapsed=self.elapsed,
+            end=end,
+            env_reward=raw.reward,
+            env_terminated=raw.terminated,
+            env_truncated=raw.truncated,
+            next_obs=raw.next_obs if whole else None,
+            next_mask=self.engine.mask() if whole else None,
+        )
+        if not whole:
+            over = np.flatnonzero(self.memory["end"])
+            out.write(over, next_obs=raw.next_obs[over])
+        self.obs = raw.next_obs
+        if len(over := np.flatnonzero(end)):
+            self._tell(out.row, over, raw.info)
+        if self.search is not None and (len(over) or len(waiting)):
+            assert step is not None
+            over = self._begun(end, over, waiting, step)
+        self._begin_anew(over)
+        out.next(raw.info)
+
+    def _searched(self, rows: Array, waiting: Array, turn: Turn) -> Array:
+        """Return actions (N, …): of the skill in ``rows``, and of the search in ``waiting``."""
+        assert self.search is not None
+        own = None
+        if len(rows):
+            own = self.policy.act(self.memory, rows, self.obs[rows], turn.some(rows))
+        found = self.search.act(waiting, self.obs, turn.mask, turn.world)
+        action = np.zeros((self.num_envs, *found.shape[1:]), found.dtype)
+        action[waiting] = found
+        if own is not None:
+            action[rows] = own
+        return action
+
+    def _begun(self, end: Array, over: Array, waiting: Array, step: Step) -> Array:
+        """Let new calls begin in episodes that go on, and the search go on where it has to.
+
+        Args:
+            end: (N,), why calls ended.
+            over: environments (k,) in which they did.
+            waiting: environments (k,) in which a start was searched for.
+            step: of all environments.
+
+        Returns:
+            The environments (k,) in which a new episode is to begin.
+        """
+        assert self.search is not None
+        if len(again := self.search.again(over[end[over] == LIMIT])):
+            self._begin_call(again, episodes=False)
+        lost = waiting[(step.terminated | step.truncated)[waiting]]
+        if len(going := np.setdiff1d(waiting, lost)):
+            lost = np.union1d(lost, self.search.observe(going, step))
+        return np.union1d(np.setdiff1d(over, again), lost)
+
+    def _goal(self, rows: Array) -> Array | None:
+        """Return the goals of all environments, (N, *goal_shape), after those of new calls.
+
+        Args:
+            rows: (k,) environments in which the skill acts.
+        """
+        if self._goals is None:
+            return None
+        needs, kept = self.kept["needs_goal"], self.kept["goal"]
+        if len(ids := rows[needs[rows]]):
+            kept[ids] = self._goals.draw(self.obs[ids], self._goal_rng)
+            needs[ids] = False
+        return kept.copy()
+
+    def _ends(self, raw: RawStep, step: Step | None, rows: Array, goal: Array | None) -> Array:
+        """Let the policy notice a step; return why calls or episodes ended, (N,) int8 ``CallEnd``.
+
+        Where skills that are called have ended, and none may start, the call of the whole ends,
+        too; its value goes on.
+
+        Args:
+            rows: (k,) environments in which the policy acted.
+            goal: (N, *goal_shape).
+        """
+        end, skill = np.zeros(self.num_envs, np.int8), self.skill
+        if self.limit is not None:
+            end[rows[self.elapsed[rows] >= self.limit]] = LIMIT
+        if step is not None and len(rows):
+            elapsed, own_goal = self.elapsed[rows], None if goal is None else goal[rows]
+            if self.policy.watches:
+                seen = step
+                if self.search is not None or goal is not None:
+                    seen = part_of(step, elapsed, rows, None, own_goal)
+                self.policy.observe(self.memory, rows, seen)
+            if skill is not None:
+                if self.policy.restricts:
+                    end[rows[self.policy.stuck(self.memory, rows, raw.next_obs[rows])]] = LIMIT
+                seen = seen_by(skill, step, elapsed, rows, own_goal)
+                end[rows[judge(skill, seen, rows).stops]] = OWN
+        over = raw.terminated | raw.truncated
+        if self.search is not None:
+            over &= ~self.search.kept["searching"]
+        end_with_episode(end, over)
+        return end
+
+    # They are judged ----------------------------------------------------------------------------
+
+    def _judge(self, trace: Trace) -> tuple[Batch, list[tuple[int, Array, Array]]]:
+        """Judge the steps of a trace.
+
+        Returns:
+            The steps as those who act are judged by them, and the episodes that ended in them:
+            row, environments, and numbers (k, 4 + I), as in ``Collected.episodes``.
+        """
+        acts, elapsed, goal = trace.valid_rows, trace["elapsed"], trace.get("goal")
+        steps = steps_of(trace, self.skill, acts, elapsed, trace["end"], goal)
+        each = np.empty((*trace.lead, 3))
+        each[..., 0], each[..., 1], each[..., 2] = steps["reward"], trace["env_reward"] * acts, acts
+        found = self._count(each)
+        if self.skill is not None and self.skill.defines("success"):
+            success = successes_of(trace, self.skill, acts, elapsed, goal)
+            for row, ids, episodes in found:
+                episodes[:, SUCCESS] = success[row, ids]
+        return steps, found
+
+    def _views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
+        """Return what each learner did, by path; ``steps`` are those of ``_judge``."""
+        return self.learning.views(trace, steps)
+
+    def _count(self, each: Array) -> list[tuple[int, Array, Array]]:
+        """Add numbers (T, N, 3) to the sums of the open episodes; return those that ended."""
+        found, self._ended = self._ended, []
+        sums: Any = self.kept["sums"]
+        at = 0
+        for row, numbers in enumerate(each):
+            sums += numbers
+            while at < len(found) and found[at][0] == row:
+                _, ids, episodes = found[at]
+                known = ~np.isnan(episodes[:, :3])
+                episodes[:, :3][known] = sums[ids][known]
+                sums[ids], at = 0.0, at + 1
+        return found
+
+    def _forget(self, ids: Array) -> None:
+        """Episodes of environments ``ids`` (k,) have just begun."""
+        self.kept["age"][ids] = 0
+        if self._last_actions is not None:
+            self.kept["last_action"][ids] = self._last_actions.start(len(ids))
+        self._begin_call(ids, episodes=True)
+
+    def _begin_call(self, ids: Array, *, episodes: bool) -> None:
+        """Let a new call begin in environments ``ids`` (k,), perhaps a new episode."""
+        restart(self.policy, self.memory, ids)
+        if self._goals is not None:
+            self.kept["needs_goal"][ids] = True
+        if self.search is not None:
+            self.search.begin(ids, self.obs, episodes=episodes)
+
+    def _clear(self, ids: Array) -> None:
+        """Nothing of environments ``ids`` (k,) is left of the requests before."""
+        for name in self.after_request:
+            self.kept[name][ids] = 0
+
+    def _begin_anew(self, ids: Array) -> Array:
+        if len(ids):
+            self.obs = self.obs.copy()
+            self.obs[ids] = self.engine.reset_some(ids)
+            self._forget(ids)
+        return ids
+
+    def _tell(self, row: int, ids: Array, info: Mapping[str, Any]) -> None:
+        """Keep the numbers of the episodes of environments ``ids`` (k,), which are over.
+
+        Args:
+            row: of the step.
+            ids: (k,).
+            info: of all environments, at this step.
+        """
+        episodes = np.full((len(ids), FIRST_INFO + len(self.log_info)), np.nan)
+        for column, key in enumerate(self.log_info, FIRST_INFO):
+            numbers = info_numbers(info, key, ids, self.num_envs)
+            if numbers is None:
+                self._info_keys |= set(info_keys(info))
+            else:
+                episodes[:, column] = numbers
+        episodes[:, [RETURN, LENGTH]] = 0.0
+        if self.skill is not None:  # the return of the task is another one
+            episodes[:, TASK_RETURN] = 0.0
+        if self.skill is None or not self.skill.defines("reward"):  # the reward is the task's
+            success = reported_success(info, self.num_envs)
+            episodes[:, SUCCESS] = np.nan if success is None else success[ids]
+        self._ended.append((row, ids, episodes))
+
+
+def as_numbers(x: Array) -> Array:
+    """Return an array (N, …) as a checkpoint holds it, the same memory: records as bytes."""
+    return x if x.dtype.names is None else x.view(np.uint8).reshape(len(x), -1)
+
+
+def _checksum(state: Mapping[str, Array]) -> int:
+    """Return a number that follows from all arrays of a state."""
+    found = 0
+    for array in state.values():
+        found = zlib.crc32(array.tobytes(), found)
+    return found
+
+
+def joined_from(collectors: Sequence[Collector], engine: Engine, acting: Acting) -> Collector:
+    """Several collectors of one kind as one, over an engine of all their environments."""
+    found: Collector = collectors[0].like(engine, acting)
+    found.log_info = collectors[0].log_info
+    for name, rows in found.kept.items():
+        if name not in OF_LEARNERS:
+            rows[:] = np.concatenate([c.kept[name] for c in collectors])
+    for name, example in collectors[0].open.items():
+        parts = [c.open.get(name, np.zeros_like(example)) for c in collectors]
+        found.open[name] = np.concatenate(padded_last_axis(parts) if name == "rewards" else parts)
+    found.obs, found.begun = np.concatenate([c.obs for c in collectors]), True
+    return found
+
+
+def parted(joined: Collector, collectors: Sequence[Collector]) -> None:
+    """Invert ``joined_from``: each stands where its part of ``joined`` does."""
+    first = 0
+    for collector in collectors:
+        part = slice(first, first + collector.num_envs)
+        for name, rows in collector.kept.items():
+            if name not in OF_LEARNERS:
+                rows[:] = joined.kept[name][part]
+        collector.open.clear()
+        collector.open |= {k: v[part].copy() for k, v in joined.open.items()}
+        collector.obs, first = joined.obs[part].copy(), part.stop
+
+
+def joined_collected(parts: Sequence[Collected], members: int) -> Collected:
+    """Join the answers of several collectors: each member's environments stand side by side."""
+    if len(parts) == 1:
+        return parts[0]
+    paths, steps = parts[0].batches, sum(p.steps for p in parts)
+    batches = {path: side_by_side([p.batches[path] for p in parts], members) for path in paths}
+    keys = frozenset[str]().union(*(p.info_keys for p in parts))
+    longest = max(p.longest for p in parts)
+    logged = [p.calls for p in parts if p.calls is not None]
+    calls = None
+    if logged:
+        calls = Batch(**{k: np.concatenate([c[k] for c in logged], axis=1) for k in logged[0]})
+    episodes = np.concatenate([p.episodes for p in parts])
+    return Collected(batches, steps, episodes, info_keys=keys, longest=longest, calls=calls)

@@ -1,0 +1,118 @@
+"""Several collectors that fill one batch, in this thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from skillweave._internal.seeding import Seeds
+from skillweave.errors import DeclarationError, RunError
+from skillweave.experience.acting import Request
+from skillweave.experience.collector import Collected, Collector, joined_collected
+from skillweave.types import Array, prefixed, unprefixed
+
+MakeCollector = Callable[[int, int], Collector]
+"""Given how many environments and the number of the first one, makes a collector."""
+
+
+class Collectors:
+    """W collectors of as many environments each, whose experience stands side by side.
+
+    Each has a part of the environments of every member. What they find depends on how many they
+    are, and not on where they run.
+
+    Args:
+        parts: the collectors, in this thread.
+        members: P.
+    """
+
+    def __init__(self, parts: Sequence[Collector], members: int = 1) -> None:
+        self.parts, self.members = list(parts), members
+        self.num_envs = sum(part.num_envs for part in parts)
+        self.steps_made = 0
+        """Environment steps that were made together."""
+        self.begun_anew = 0
+        """Environments that were lost with their worker, and did not repeat themselves."""
+
+    def start(self, seeds: Seeds) -> None:
+        """Start every environment, unless they have started."""
+        for i, part in enumerate(self.parts):
+            part.start(seeds / i)
+
+    def collect(self, request: Request) -> Collected:
+        """``request.rows`` steps of each environment."""
+        found = [part.collect(request.of_collector(i)) for i, part in enumerate(self.parts)]
+        return self._joined(found)
+
+    def state(self) -> dict[str, Array]:
+        """Return what ``restore`` needs. It changes nothing."""
+        return joined_states([part.state() for part in self.parts])
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Restore the open episodes of ``state``; return (k,) environments that start again."""
+        states = split_states(state, len(self.parts))
+        return self._columns([p.restore(s) for p, s in zip(self.parts, states, strict=True)])
+
+    def differing(self) -> Array:
+        """(k,) environments that are not where they were, since they were lost with a worker.
+
+        Learners have seen them elsewhere, so what was open there must not go on. Each is
+        returned once.
+        """
+        return np.empty(0, np.int64)
+
+    def close(self) -> None:
+        """Release the environments."""
+        for part in self.parts:
+            part.close()
+
+    def _joined(self, found: Sequence[Collected]) -> Collected:
+        collected = joined_collected(found, self.members)
+        self.steps_made += collected.steps
+        return collected
+
+    def _columns(self, ids: Sequence[Array]) -> Array:
+        """Environments of each collector as columns of the experience."""
+        count = len(ids)
+        each = self.num_envs // self.members  # of a member
+        own = each // count  # of a member, in one collector
+        found = [part // own * each + number * own + part % own for number, part in enumerate(ids)]
+        return np.sort(np.concatenate(found))
+
+
+def joined_states(states: Sequence[dict[str, Array]]) -> dict[str, Array]:
+    """Return the states of several collectors as one; see ``split_states``."""
+    found: dict[str, Array] = {"collectors": np.array([len(states)])}
+    for i, state in enumerate(states):
+        found |= prefixed(str(i), state)
+    return found
+
+
+def split_states(state: dict[str, Array], count: int) -> list[dict[str, Array]]:
+    """Return the states of each of ``count`` collectors.
+
+    Raises:
+        RunError: it is that of another number of collectors.
+    """
+    saved = int(state["collectors"][0])
+    if saved != count:
+        raise RunError(
+            f"the checkpoint is of {saved} collectors, but there are {count}: a run goes on with "
+            "as many as it began with"
+        )
+    return [unprefixed(str(i), state) for i in range(count)]
+
+
+def share_of(num_envs: int, workers: int, members: int, name: str) -> int:
+    """Environments of each of ``workers``; those of every member are shared out equally.
+
+    Raises:
+        DeclarationError: they cannot be.
+    """
+    if num_envs % (workers * members):
+        raise DeclarationError(
+            f"{name}: num_envs is {num_envs // members}; it must be a multiple of workers, "
+            f"{workers}, so that each has as many environments"
+        )
+    return num_envs // workers

@@ -1,0 +1,97 @@
+"""Traces as they are written: a row of all environments at a time."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from skillweave.algorithms.batches import Trace, column
+from skillweave.errors import EnvError
+from skillweave.types import Array
+
+
+class TraceWriter:
+    """Writes the rows of a trace, from the first to the last.
+
+    A column exists from its first value on; what is not written has the column's ``fill``.
+
+    Args:
+        rows: T, the most there will be.
+        num_envs: N.
+        keep_infos: keep the ``info`` of each step.
+    """
+
+    def __init__(self, rows: int, num_envs: int, *, keep_infos: bool = False) -> None:
+        self._lead, self._columns = (rows, num_envs), dict[str, Array]()
+        self._infos: list[Mapping[str, Any]] | None = [] if keep_infos else None
+        self.row = 0
+        """The row that is written."""
+
+    def write(self, ids: Array | None = None, **values: Array | None) -> None:
+        """Write values of the row, (N, …); None: nothing.
+
+        Args:
+            ids: (k,) only in these environments, ascending; values are (k, …).
+        """
+        every = ids is None or len(ids) == self._lead[1]  # several times as fast
+        at: Any = self.row if every else (self.row, ids)
+        for name, value in values.items():
+            if value is not None:
+                self._column(name, value)[at] = value
+
+    def _column(self, name: str, like: Array) -> Array:
+        """Return a column, (T, N, …), of the shape and type of ``like`` (k, …) if it is new."""
+        values = self._columns.get(name)
+        if values is None:
+            shape, fill = (*self._lead, *like.shape[1:]), column(name).fill
+            values = np.full(shape, fill, like.dtype) if fill else np.zeros(shape, like.dtype)
+            self._columns[name] = values
+        return values
+
+    def next(self, info: Mapping[str, Any]) -> None:
+        """Start the next row; ``info`` is that of the row's step."""
+        if self._infos is not None:
+            self._infos.append(kept_info(info))
+        self.row += 1
+
+    def trace(self) -> Trace:
+        """Return what was written."""
+        whole = self.row == self._lead[0]
+        columns = {k: v if whole else v[: self.row] for k, v in self._columns.items()}
+        return Trace(self._infos or (), columns)
+
+
+def kept_info(info: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return an info that stays as it is: objects are copied, as environments may change them."""
+    if all(isinstance(v, np.ndarray) and v.dtype != object for v in info.values()):
+        return info
+    return {key: _copied(value, key) for key, value in info.items()}
+
+
+def _copied(value: Any, key: str) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        return value
+    if isinstance(value, dict):
+        return kept_info(value)
+    try:
+        return copy.deepcopy(value)
+    except Exception:
+        return _Uncopied(key)
+
+
+class _Uncopied:
+    """Stands for a value of ``info`` that a skill cannot be shown after its step."""
+
+    def __init__(self, key: str) -> None:
+        self._key = key
+
+    def _refuse(self, *_: Any) -> Any:
+        raise EnvError(
+            f"info[{self._key!r}] holds an object that cannot be copied, and rewards are computed "
+            "after the steps of a round: let the environment set numbers or arrays there"
+        )
+
+    __getattr__ = __getitem__ = __array__ = __iter__ = __len__ = _refuse

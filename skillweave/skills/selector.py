@@ -1,0 +1,149 @@
+"""The base of ready selectors, which choose skills without training."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, Self
+
+import numpy as np
+from gymnasium import Space
+from gymnasium.spaces import Dict
+
+from skillweave._internal.messages import shortened
+from skillweave._internal.terminal import one_line
+from skillweave.errors import DeclarationError
+from skillweave.policies.core import LastCall
+from skillweave.policies.functional import Functional
+from skillweave.policies.parts import GOAL
+from skillweave.policies.selectors import Rule, function_name as function_name
+from skillweave.policies.spaces import space_of
+from skillweave.skills.foreign_policy import Foreign
+from skillweave.skills.goal_spaces import alone
+from skillweave.skills.outputs import Wrapped as Wrapped, answer, called
+from skillweave.types import Array, Memory, Memoryless, Step
+
+
+class ReadySelector(Functional, Foreign):
+    """A selector that is not trained: a policy over skills that also observes the ends of calls.
+
+    It is called only where a call is over. It respects the skills' initiation sets, which are its
+    mask. Its whole state is its memory, with a row for each environment.
+    """
+
+    lengths: tuple[int, ...] = ()
+    """The lengths of calls that it chooses with skills; empty: it chooses skills alone."""
+    in_place: Any
+    """The ``Rule`` that acts, whose functions are asked with this library's messages.
+
+    It is made when it is first needed, so that the skills and their goals are known; it raises a
+    SkillError where a fixed goal does not fit its skill."""
+    observe = Memoryless.observe  # it watches instead
+
+    def __init__(self, name: str) -> None:
+        Foreign.__init__(self, name)
+        self.skills: tuple[str, ...] = ()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what copies have: each makes its own rule."""
+        made = ("in_place", "_like")
+        return {name: value for name, value in vars(self).items() if name not in made}
+
+    @property
+    def ranges(self) -> dict[str, range]:
+        """Return the valid range of each index in its memory, by name."""
+        return dict(self.in_place.values())
+
+    def named(self) -> Iterable[tuple[str, str, Any]]:
+        """Return the skills that its declaration names: where, their names and goals or None."""
+        return ()
+
+    def among(self, skills: tuple[str, ...]) -> Self:
+        """Return a copy that chooses among the ``skills`` of these names, in the hierarchy's order.
+
+        Raises:
+            DeclarationError: it names another skill.
+        """
+        selector, rule = copy.copy(self), Rule(self.kind, skills, {})
+        selector.skills = skills
+        for where, name, _ in self.named():
+            rule.number(name, f": {where}", DeclarationError)
+        return selector
+
+    @property
+    def goal_spaces(self) -> dict[str, Space[Any]]:
+        """Return the spaces of goals of the skills that have some, by name, once it is bound."""
+        space = self.action_space
+        goals = space[GOAL] if isinstance(space, Dict) else None
+        return dict(goals.spaces) if isinstance(goals, Dict) else {}
+
+    @property
+    def _rule_of(self) -> tuple[str, tuple[str, ...], dict[str, Any]]:
+        """Return what every ``Rule`` is made of: who, skills and goals."""
+        goals = {name: space_of(space) for name, space in self.goal_spaces.items()}
+        return self._who, self.skills, goals
+
+    def chances(self, memory: Memory, obs: Array, mask: Array) -> tuple[Array, Memory]:
+        """Return the probability of each choice where a call is over, (n, choices) float32.
+
+        Args:
+            memory: of n environments.
+            obs: (n, …).
+            mask: (n, choices) bool, what may be chosen.
+
+        Returns:
+            The probabilities, and the memory after the choice.
+        """
+        memory, own = self._copied(memory)
+        return self.in_place.chances(own, np.arange(len(obs)), obs, mask), memory
+
+    def allowed(self, memory: Memory) -> Array | None:
+        """Return the skills that it may choose next, (n, S) bool; None: depends on observations.
+
+        Args:
+            memory: of n environments.
+        """
+        skills: Array | None = self.in_place.allowed(memory, slice(None))
+        return skills
+
+    def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
+        """Return the memory after a step of n environments; called after every step.
+
+        Args:
+            memory: of these environments.
+            step: the environments' transition; ``elapsed`` counts as for any policy.
+            last: the last calls; ``why`` is 0 (``CallEnd.RUNNING``) where the call continues.
+        """
+        memory, own = self._copied(memory)
+        self.in_place.watch(own, np.arange(len(last.why)), step, last)
+        return memory
+
+    def _goal(self, name: str, goal: Any, where: str) -> Any:
+        """Return a goal of ``(name, goal)`` for a rule; ``where`` it is declared, for messages."""
+        if callable(goal):
+            return Wrapped(goal, partial(called, goal, who=f"{where}: the goal of {name!r}"))
+        if (space := self.goal_spaces.get(name)) is None:
+            return goal
+        data = space_of(space)
+        goals = data.goals(alone(data, goal), 1, self._who, f"skill {name!r}")
+        return goals.reshape(data.shape)
+
+
+def checked_function(
+    function: Callable[[Any], Any], who: str, name: str, dtype: type = bool
+) -> Wrapped:
+    """Return a function of observations or of steps to (n,), whose answers are checked."""
+    return Wrapped(function, partial(answer, function, dtype=dtype, who=f"{who}: {name}()"))
+
+
+def goal_as_json(goal: Any) -> Any:
+    """Return a goal of ``(name, goal)`` for checksums; of a function its name."""
+    if callable(goal):
+        return {"function": function_name(goal)}
+    return repr(goal.tolist() if isinstance(goal, np.ndarray) else goal)
+
+
+def listed(names: tuple[str, ...]) -> str:
+    """Join names to a part of a sentence."""
+    return shortened(one_line(", ".join(names)), 300)

@@ -1,0 +1,276 @@
+"""The skills below one selector: what a choice means, where it may be made, how long it lasts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import gymnasium as gym
+
+from skillweave.errors import PolicyError
+from skillweave.policies.core import Choices, Policy, innermost
+from skillweave.policies.functional import Functional, Returns
+from skillweave.policies.hierarchy import ActiveGuide, CalledSkill, Hierarchy, Interruption
+from skillweave.policies.leaves import Ready
+from skillweave.policies.parts import Corrects, Given, Joined, PartOf, Reflexes, Remembers
+from skillweave.policies.spaces import space_of
+from skillweave.skills import Reflex, Skill, path_of
+from skillweave.skills.goal_spaces import choice_space
+from skillweave.skills.goals import Goals, goals_of
+from skillweave.skills.lengths import Lengths
+from skillweave.skills.outputs import ask, blame
+from skillweave.skills.own_part import OwnPart
+from skillweave.types import Memoryless
+
+
+class LimitedCalls(Choices):
+    """Calls of skills that ``call_steps`` limits."""
+
+    call_steps: int | Lengths | None
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """The lengths that are chosen from; none where no length is chosen."""
+        return self.call_steps.steps if isinstance(self.call_steps, Lengths) else ()
+
+
+@dataclass(frozen=True)
+class SkillSet(LimitedCalls):
+    """Skills with their policies, and the limits of their calls; ``hierarchy_of`` lets them act."""
+
+    skills: tuple[Skill, ...]
+    policies: tuple[Any, ...]
+    reflexes: tuple[Reflex, ...] = ()
+    call_steps: int | Lengths | None = None
+    """A call lasts at most so long; None: until the skill stops by itself."""
+    greedy: bool = True
+    """Skills act greedily; else they sample."""
+
+    call_cost: float = 0.0
+    """What a selector that learns pays for each call, in units of reward."""
+    interruption: Interruption | None = None
+    """When the selector cuts a call; None: never."""
+    parts: tuple[OwnPart | None, ...] = ()
+    """The own part of each skill's observations and actions, None: it has all; (): no skill has
+    one."""
+    greedy_selector: bool = True
+    """The selector is greedy where its caller asks for deterministic actions; else it samples."""
+
+    @property
+    def choice_space(self) -> gym.Space[Any]:
+        """The space of choices; where skills have goals, a choice has some."""
+        goal_spaces = {s.name: s.goal_space for s in self.skills if s.goal_space is not None}
+        return choice_space(self.choices, goal_spaces, [s.name for s in self.skills])
+
+    @cached_property
+    def hierarchy(self) -> Hierarchy:
+        """The skills in calls, without a selector."""
+        return hierarchy_of(self)
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """The environment's space of actions."""
+        part = next((part for part in self.parts if part is not None), None)
+        return self.policies[0].action_space if part is None else part.whole_action_space
+
+    def part(self, i: int) -> OwnPart | None:
+        """Return the own part of skill ``i``; None: it has all."""
+        return self.parts[i] if self.parts else None
+
+    def limit(self, i: int) -> int | None:
+        """Return the steps after which a call of skill ``i`` is cut, by any limit; None: never."""
+        skill = self.skills[i]
+        most = self.call_steps if skill.call_steps is None else skill.call_steps
+        limits = [x for x in (most, skill.max_steps) if isinstance(x, int)]
+        return min(limits) if limits else None
+
+
+def skills_below(policy: Any) -> SkillSet | None:
+    """Return the skills of a policy that is a hierarchy; None: it is none."""
+    found = getattr(policy, "skills", None)
+    return found if isinstance(found, SkillSet) else None
+
+
+def acting_policy(
+    skills: SkillSet,
+    selector: Any = None,
+    guide: ActiveGuide | None = None,
+    goals: Goals | None = None,
+    *,
+    outermost: bool = True,
+) -> Policy:
+    """Return the policy of a selector and its skills, with reflexes.
+
+    Args:
+        selector, guide, goals: see ``hierarchy_of``.
+        outermost: it remembers the last action, where that counts for a skill; else
+            it is in the ``World``.
+    """
+    policy: Policy = hierarchy_of(skills, selector, guide, goals)
+    if skills.reflexes:
+        policy = Reflexes(policy, skills.reflexes, space_of(skills.action_space))
+    return _remembering(policy, skills) if outermost else policy
+
+
+def acting_alone(skills: SkillSet, i: int) -> Policy:
+    """Return the policy of skill ``i`` without a selector, with reflexes."""
+    skill, space = skills.skills[i], skills.action_space
+    policy = acting_apart(skills.policies[i], skill, skills.part(i), skills.reflexes, space)
+    goals = goals_of(skill)
+    return _remembering(policy if goals is None else Given(policy, goals), skills)
+
+
+def hierarchy_of(
+    skills: SkillSet,
+    selector: Any = None,
+    guide: ActiveGuide | None = None,
+    goals: Goals | None = None,
+) -> Hierarchy:
+    """Return skills in calls.
+
+    Args:
+        skills: with their policies; one that has skills and a selector itself is a hierarchy.
+        selector: chooses where a call has ended; None: the caller does, by ``begin``.
+        guide: a ready selector that restricts the choices.
+        goals: of the hierarchy, as a skill that has goals.
+    """
+    if guide is not None and guide.decides:
+        selector, guide = guide.selector, None
+    inside = tuple(_skill(skills, i) for i in range(len(skills.skills)))
+    return Hierarchy(
+        None if selector is None else selects(selector, "the selector's act()"),
+        inside,
+        lengths=skills.lengths,
+        guide=guide and replace(guide, selector=selects(guide.selector, "the guide")),
+        interruption=skills.interruption,
+        fresh_calls=goals is not None,
+        greedy=skills.greedy,
+        greedy_selector=skills.greedy_selector,
+        ask=ask,
+    )
+
+
+def within(policy: Policy) -> Hierarchy:
+    """Return the hierarchy that reflexes and the like stand around."""
+    inside = innermost(policy)
+    assert isinstance(inside, Hierarchy)
+    return inside
+
+
+def in_place(policy: Any, who: str = "the policy's act()") -> Policy:
+    """Return a policy of any form as one whose memory is changed in place; ``who`` for messages."""
+    if isinstance(policy, Policy):
+        return policy
+    if isinstance(policy, Functional) and policy.is_plain:
+        return policy.in_place
+    watches = getattr(type(policy), "observe", None) is not Memoryless.observe
+    return Returns(policy, who, blame, watches=watches)
+
+
+def acting_apart(
+    policy: Any,
+    skill: Skill | None,
+    part: OwnPart | None,
+    reflexes: tuple[Reflex, ...],
+    space: gym.Space[Any],
+) -> Policy:
+    """Return the policy of a skill that acts by itself, or of a plain agent, with reflexes.
+
+    Args:
+        policy: the skill's; see ``policy_of``.
+        skill: None: a plain agent.
+        part: of the skill.
+        reflexes: in force.
+        space: of the environment's actions.
+    """
+    whole = _whole(policy, skill, part)
+    return Reflexes(whole, reflexes, space_of(space)) if reflexes else whole
+
+
+def _whole(policy: Any, skill: Skill | None, part: OwnPart | None) -> Policy:
+    """Return a skill's policy, whose actions are whole ones."""
+    who = "" if skill is None else f"skill {path_of(skill)!r}: its policy's act()"
+    found = policy_of(policy, goals_of(skill), part, who)
+    return found if part is None else PartOf(found, part.part)
+
+
+def _skill(skills: SkillSet, i: int) -> CalledSkill:
+    skill = skills.skills[i]
+    path, goals = path_of(skill), goals_of(skill)
+    policy = _whole(skills.policies[i], skill, skills.part(i))
+    asks = {name: getattr(skill, name) for name in ENDS if skill.defines(name)}
+    return CalledSkill(
+        skill.name, path, policy, skills.limit(i), skill.max_steps, goals=goals, **asks
+    )
+
+
+def _remembering(policy: Policy, skills: SkillSet) -> Policy:
+    """Return a policy that remembers the last action where that counts."""
+    return Remembers(policy, space_of(skills.action_space)) if policy.holds else policy
+
+
+def policy_of(
+    policy: Any, goals: Goals | None, part: OwnPart | None, who: str, *, outermost: bool = False
+) -> Policy:
+    """Return a skill's policy, whose actions are those of its own part.
+
+    Args:
+        policy: of any form; None: it is not there yet.
+        goals, part: of the skill.
+        who: for messages.
+        outermost: see ``acting_policy``.
+    """
+    if policy is None:
+        return Policy()
+    known = isinstance(policy, Functional) and policy.is_plain
+    if hasattr(policy, "act"):
+        inside, joins = in_place(policy, who), not (known and policy.joins)
+        if isinstance(inside, Remembers) and not outermost:
+            inside = inside.policy
+        _check_memory(inside)
+    else:  # a hierarchy that learns
+        how = policy.skills, policy.selector, policy.guide, policy.goals
+        inside, joins = acting_policy(*how, outermost=outermost), policy.goals is None
+    inside = Joined(inside) if joins and goals is not None else inside
+    if part is None or part.correction is None:
+        return inside
+    return Corrects(inside, base_of(part, goals), part.correction)
+
+
+def base_of(part: OwnPart, goals: Goals | None) -> Policy:
+    """Return the policy that a skill corrects; a hierarchy remembers its own last actions."""
+    who = f"{part.who}: the act() of the policy that it corrects"
+    return policy_of(part.base, goals, None, who, outermost=True)
+
+
+ENDS = ("initiation", "termination", "success")
+"""The methods of a skill that are asked while it acts."""
+
+
+def selects(selector: Any, who: str) -> Policy:
+    """Return a selector's policy; one that is not trained watches how calls end.
+
+    Args:
+        who: for messages.
+    """
+    if not hasattr(selector, "watch"):
+        return in_place(selector, who)
+    kind, asked = type(selector), ("start", "act", "chances", "allowed", "watch")
+    methods = (getattr(kind, name, None) for name in asked)
+    # Where the user has another way, it counts.
+    ours = all(getattr(one, "__module__", "").startswith("skillweave.") for one in methods)
+    rule: Policy | None = getattr(selector, "in_place", None) if ours else None
+    return Ready(selector, who, blame) if rule is None else rule
+
+
+def _check_memory(policy: Policy) -> None:
+    """Raise a PolicyError where a checkpoint could not hold what a policy remembers."""
+    if not isinstance(policy, Returns):
+        return
+    for name, value in policy.start(1).items():
+        if value.dtype.names is None and value.dtype.kind not in "biuf":
+            raise PolicyError(
+                f"{policy.who} remembers {name!r} as {value.dtype}; a memory is an array of "
+                "numbers whose first axis is the environment"
+            )

@@ -1,0 +1,324 @@
+"""Collectors that run elsewhere: what they are asked for, and how lost ones are made again.
+
+A collector is a function of its state and of what it is asked for. So a lost worker, a
+process or a machine, is recreated from its last state and repeats the requests since then; the
+result is identical.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from skillweave._internal.messages import error_text
+from skillweave._internal.seeding import Seeds
+from skillweave.envs.engine import checksums
+from skillweave.errors import SkillweaveError, TrainingError, kind_of, reworded
+from skillweave.experience.acting import Request
+from skillweave.experience.collector import Collected
+from skillweave.experience.group import Collectors, joined_states, split_states
+from skillweave.types import Array
+
+SNAPSHOT_EVERY = 16
+"""Requests after which workers say where they stand, so that less need be done again."""
+
+
+WorkerFactory = Callable[[int, int], Any]
+"""Makes what stands at a worker and does its tasks, as ``MakeCollector`` makes a collector."""
+
+
+SentError = tuple[str, str]
+"""The kind of an error and its message, as a worker sends them."""
+
+
+def error_to_send(error: BaseException) -> SentError:
+    """Return the kind of an error and its message; the environment's own errors are EnvErrors."""
+    if isinstance(error, SkillweaveError):
+        return kind_of(error), str(error)
+    return "TrainingError" if isinstance(error, MemoryError) else "EnvError", error_text(error)
+
+
+class WorkerLost(Exception):
+    """A worker's process or machine is no more; the message says what became of it."""
+
+
+class Worker(Protocol):
+    """Somebody elsewhere who has a collector: it does one task after another."""
+
+    def begin(self) -> None:
+        """Have the collector made; ``receive`` then gives None."""
+        ...
+
+    def send(self, what: str, task: Any) -> None:
+        """Ask for something; see ``Station.answer``.
+
+        Raises:
+            WorkerLost: it has ended.
+        """
+        ...
+
+    def receive(self) -> Any:
+        """Return the answer to the oldest task that has none.
+
+        Raises:
+            WorkerLost: it has ended.
+            SkillweaveError: the collector failed; the kind and the message are those of its error.
+        """
+        ...
+
+    def release(self) -> None:
+        """End it, if it has not ended."""
+        ...
+
+
+class WorkerHost:
+    """The object at a worker that answers tasks: a collector, or part of a population.
+
+    Args:
+        each: its environments, if it is a collector.
+        number: of the worker.
+    """
+
+    def __init__(self, make: WorkerFactory, each: int, number: int) -> None:
+        self.number, self.collector = number, make(each, number * each)
+
+    def answer(self, what: str, task: Any) -> Any:
+        """Do what a method of the collector does; a request is for all workers."""
+        if what == "state":
+            return self.collector.state()
+        if what != "collect":
+            return getattr(self.collector, what)(task)
+        found = self.collector.collect(task.of_collector(self.number))
+        kept = self.collector.kept  # where few observations are possible, they alone tell little
+        about = np.column_stack([kept["age"], kept["sums"]])
+        found.stands = checksums(self.collector.obs) + checksums(about)
+        return found
+
+
+class LocalWorker:
+    """A worker in this thread: it does a task when it is asked for the answer.
+
+    Args:
+        each: its environments, if it has a collector.
+        number: of the worker.
+    """
+
+    def __init__(self, make: WorkerFactory, each: int, number: int) -> None:
+        self._make, self._each, self._number = make, each, number
+        self._station: WorkerHost | None = None
+        self._due = deque[tuple[str, Any]]()
+
+    def begin(self) -> None:
+        """Have the collector made; ``receive`` then gives None."""
+        self._due.append(("", None))
+
+    def send(self, what: str, task: Any) -> None:
+        """Ask for something."""
+        self._due.append((what, task))
+
+    def receive(self) -> Any:
+        """Return the answer to the oldest task that has none."""
+        what, task = self._due.popleft()
+        if self._station is None:
+            self._station = WorkerHost(self._make, self._each, self._number)
+            return None
+        return self._station.answer(what, task)
+
+    def release(self) -> None:
+        """Close what stands here."""
+        station, self._station = self._station, None
+        if station is not None:
+            station.collector.close()
+
+
+class Workers:
+    """Workers that are asked side by side; those that are lost are made again.
+
+    Args:
+        workers: W of them.
+        name: what messages call the environment.
+
+    Raises:
+        SkillweaveError: a task failed; the kind is the kind of its error.
+        TrainingError: a worker was lost again and again at the same place; the message names it.
+    """
+
+    tries = 1
+    """How often lost workers are made again before a request fails."""
+
+    def __init__(self, workers: Sequence[Worker], name: str) -> None:
+        self._workers, self._name = list(workers), name
+        self._past: list[tuple[str, Sequence[Any]]] = []
+        """What brings workers to where they stand: a start or states, then tasks."""
+        try:
+            for worker in self._workers:
+                worker.begin()
+            self._completed(self._received(range(len(workers))), [])
+        except BaseException:
+            self.close()
+            raise
+
+    def ask(self, what: str, tasks: Sequence[Any], kept: bool = True) -> list[Any]:
+        """Return the workers' answers, each to a task of its own; lost workers are recreated.
+
+        Args:
+            kept: the tasks change where workers stand.
+        """
+        path = [*self._past, (what, tasks)]
+        if kept:
+            self._past = path
+        return self._completed(self._asked(range(len(self._workers)), what, tasks), path)
+
+    def states(self) -> list[dict[str, Array]]:
+        """Return the states of the workers; lost ones go back no further from now on."""
+        states: list[dict[str, Array]] = self.ask("state", [None] * len(self._workers), kept=False)
+        self._past = [("restore", states)]
+        return states
+
+    def stand(self, states: Sequence[dict[str, Array]]) -> list[Array]:
+        """Restore the open episodes of each worker; return environments that start again."""
+        self._past = []
+        return self.ask("restore", states)
+
+    def close(self) -> None:
+        """End the workers."""
+        for worker in self._workers:
+            worker.release()
+
+    def _completed(
+        self, found: dict[int, Any], path: Sequence[tuple[str, Sequence[Any]]]
+    ) -> list[Any]:
+        """Return the answers of all workers; those that are not in ``found`` are recreated."""
+        for tried in range(self.tries):
+            if lost := [i for i in range(len(self._workers)) if i not in found]:
+                found |= self._again(lost, path, must=tried == self.tries - 1)
+        return [found[i] for i in range(len(self._workers))]
+
+    def _again(
+        self, numbers: list[int], path: Sequence[tuple[str, Sequence[Any]]], must: bool
+    ) -> dict[int, Any]:
+        """Make workers again, and let them do all that others did."""
+        for i in numbers:
+            self._workers[i].release()
+        for i in numbers:
+            self._workers[i].begin()
+        found = self._received(numbers, must)
+        for at, (what, tasks) in enumerate(path, 1):
+            found = self._asked(found, what, tasks, must)
+            if at < len(path):
+                self._did_again(what, found)
+        return found
+
+    def _did_again(self, what: str, found: dict[int, Any]) -> None:
+        """Return the answers of workers that repeated what lost ones had done."""
+
+    def _asked(
+        self, numbers: Iterable[int], what: str, tasks: Sequence[Any], must: bool = False
+    ) -> dict[int, Any]:
+        """Return the answers of some workers, without those that are lost."""
+        numbers = list(numbers)
+        for i in numbers:
+            with suppress(WorkerLost):  # that is found out when it should answer
+                self._workers[i].send(what, tasks[i])
+        return self._received(numbers, must)
+
+    def _received(self, numbers: Iterable[int], must: bool = False) -> dict[int, Any]:
+        """Return the answers of some workers; ``must``: none may be lost."""
+        found = {}
+        for i in numbers:
+            try:
+                found[i] = self._workers[i].receive()
+            except WorkerLost as lost:
+                if must:
+                    raise self._failed(i, lost) from None
+            except SkillweaveError as error:
+                raise reworded(error, f"{error} (in worker {i})") from error
+        return found
+
+    def _failed(self, number: int, lost: WorkerLost) -> TrainingError:
+        return TrainingError(
+            f"{self._name}: worker {number}{self._whose(number)} {lost}, and again when it was "
+            "made again"
+        )
+
+    def _whose(self, number: int) -> str:
+        """Describe a worker's environments for messages."""
+        return ""
+
+
+class WorkerCollectors(Workers, Collectors):
+    """Collectors elsewhere, each with as many environments.
+
+    Args:
+        workers: W of them.
+        each: environments of a worker.
+        members: P.
+        name: what messages call the environment.
+    """
+
+    def __init__(self, workers: Sequence[Worker], each: int, members: int, name: str) -> None:
+        self.members, self.num_envs = members, each * len(workers)
+        self.steps_made = self.begun_anew = 0
+        self.parts, self._each = [], each
+        none = np.empty(0, np.int64)
+        self._stands = [none] * len(workers)  # of each, after what was collected last
+        self._differ = [none] * len(workers)  # of each, environments that did not repeat themselves
+        super().__init__(workers, name)
+
+    def start(self, seeds: Seeds) -> None:
+        """Start every environment, unless they have started."""
+        if not self._past:
+            self.ask("start", self._divided(seeds))
+
+    def collect(self, request: Request) -> Collected:
+        """``request.rows`` steps of each environment."""
+        answers: list[Collected] = self.ask("collect", self._shared(request))
+        self._stands = [answer.stands for answer in answers]  # type: ignore[misc]
+        found = replace(self._joined(answers), begun_anew=self.differing())
+        if len(self._past) > SNAPSHOT_EVERY:
+            self.states()
+        return found
+
+    def state(self) -> dict[str, Array]:
+        """Return what ``restore`` needs. Only a worker that is lost meanwhile can change."""
+        return joined_states(self.states())
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Restore the open episodes of ``state``; return (k,) environments that start again."""
+        return self._columns(self.stand(split_states(state, len(self._workers))))
+
+    def _did_again(self, what: str, found: dict[int, Any]) -> None:
+        for i, answer in found.items():
+            if what == "restore":
+                self._differ[i] = answer
+            elif what == "collect":
+                self._differ[i] = np.flatnonzero(answer.stands != self._stands[i])
+
+    def differing(self) -> Array:
+        """(k,) environments that are not where they were, since they were lost with a worker."""
+        found, none = self._columns(self._differ), np.empty(0, np.int64)
+        self._differ = [none] * len(self._differ)
+        self.begun_anew += len(found)
+        return found
+
+    def _shared(self, task: Any) -> Sequence[Any]:
+        """Return a task for each worker, where all get the same."""
+        return [task] * len(self._workers)
+
+    def _divided(self, seeds: Seeds) -> list[Seeds]:
+        """Seeds of each worker's own."""
+        return [seeds / number for number in range(len(self._workers))]
+
+    def _whose(self, number: int) -> str:
+        return environments_of(number, self._each)
+
+
+def environments_of(number: int, each: int) -> str:
+    """Return which environments a worker has, for messages."""
+    first = number * each
+    return f" (environments {first} to {first + each - 1})"
