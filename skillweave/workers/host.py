@@ -55,7 +55,7 @@ class Worker(Protocol):
         ...
 
     def send(self, what: str, task: Any) -> None:
-        """Ask for something; see ``Station.answer``.
+        """Ask for something; see ``WorkerHost.answer``.
 
         Raises:
             WorkerLost: it has ended.
