@@ -221,6 +221,6 @@ def test_a_selector_is_learnt_over_skills_with_and_without_the_tree_beside_it(de
     found.env = replace(found.spec, workers=1)
     found.skill("recover").policy = arm.above
     run = found.train(tmp_path / "run", quiet=True)
-    assert ("guide" in run.info()) == (declare is arm.anchored)
+    assert ("guide" in run.info()["hierarchy"]) == (declare is arm.anchored)
     usage = run.evaluate(2).to_json()["skill_usage"]
     assert sum(usage.values()) == pytest.approx(1.0)

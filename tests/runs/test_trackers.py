@@ -189,12 +189,15 @@ def test_a_film_in_the_run_itself_goes_to_its_trackers(
 
 
 OFFLINE = """
-import socket, sys
+import sys
 from pathlib import Path
+from skillweave import PPO, Agent
+from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import make_trackers
 
-run = RunDirectory.create(Path(sys.argv[1]), {"env": "CartPole-v1", "seed": 0, "stages": []})
+manifest = training.manifest(Agent("CartPole-v1", PPO(), 1000), seed=0)
+run = RunDirectory.create(Path(sys.argv[1]), manifest)
 (tracker,) = make_trackers(("wandb",), run)
 tracker.stage("landing", 1000)
 tracker.tick("landing", 128, 0.5, {"return": 1.5})
