@@ -12,8 +12,8 @@ from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.predicates import Predicate
+from skillweave.policies.selectors import function_name
 from skillweave.skills.outputs import called, checked
-from skillweave.skills.selector import function_name
 from skillweave.types import Array, Step, read_only
 
 

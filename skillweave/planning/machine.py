@@ -18,9 +18,11 @@ from skillweave._internal.messages import short, suggest
 from skillweave.errors import DeclarationError
 from skillweave.planning.predicates import Event, Held, Predicate, as_event
 from skillweave.policies.plan import Machine
+from skillweave.policies.selectors import function_name
 from skillweave.schema import fitted
 from skillweave.skills.automaton import Automaton, StateName, check_transitions
-from skillweave.skills.selector import Wrapped, checked_function, function_name, listed
+from skillweave.skills.outputs import Wrapped
+from skillweave.skills.selector import checked_function, listed
 from skillweave.types import LARGEST_REWARD, Array, Step
 
 MOST_STATES = 10_000

@@ -16,7 +16,7 @@ from skillweave.errors import DeclarationError
 from skillweave.ops.moments import is_constant, scale_of
 from skillweave.ops.seen import Seen
 from skillweave.policies import plan
-from skillweave.skills.selector import Wrapped
+from skillweave.skills.outputs import Wrapped
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
 

@@ -14,10 +14,10 @@ import numpy as np
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError, SkillError
+from skillweave.policies.selectors import function_name
 from skillweave.schema import AtLeastOne, fitted
 from skillweave.skills import Skill
 from skillweave.skills.outputs import answer
-from skillweave.skills.selector import function_name
 from skillweave.types import Array, Step
 
 Reads = Literal["obs", "step"]

@@ -17,14 +17,9 @@ from skillweave.errors import DeclarationError
 from skillweave.policies import selectors
 from skillweave.policies.errors import PolicyError
 from skillweave.policies.files import checksum
-from skillweave.policies.selectors import skill_and_goal
+from skillweave.policies.selectors import function_name, skill_and_goal
 from skillweave.schema import Check, fitted
-from skillweave.skills.selector import (
-    ReadySelector,
-    checked_function,
-    function_name,
-    goal_as_json,
-)
+from skillweave.skills.selector import ReadySelector, checked_function, goal_as_json
 from skillweave.types import Step
 
 Event = Callable[[Step], Any] | str

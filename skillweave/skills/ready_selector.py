@@ -11,17 +11,11 @@ from skillweave.errors import DeclarationError
 from skillweave.policies import selectors
 from skillweave.policies.core import LastCall
 from skillweave.policies.files import checksum
-from skillweave.policies.selectors import Asked, Branch, Check, Leaf, skill_and_goal
+from skillweave.policies.selectors import Asked, Branch, Check, Leaf, function_name, skill_and_goal
 from skillweave.skills.foreign_policy import made_up, qualified
-from skillweave.skills.outputs import called, required_arguments
+from skillweave.skills.outputs import Wrapped, called, required_arguments
 from skillweave.skills.probing import probe
-from skillweave.skills.selector import (
-    ReadySelector,
-    Wrapped,
-    checked_function,
-    function_name,
-    goal_as_json,
-)
+from skillweave.skills.selector import ReadySelector, checked_function, goal_as_json
 from skillweave.skills.tree import Composite, Condition, Node, Sequence
 from skillweave.types import Array
 

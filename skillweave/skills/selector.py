@@ -17,11 +17,11 @@ from skillweave.errors import DeclarationError
 from skillweave.policies.core import LastCall
 from skillweave.policies.functional import Functional
 from skillweave.policies.parts import GOAL
-from skillweave.policies.selectors import Rule, function_name as function_name
+from skillweave.policies.selectors import Rule, function_name
 from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.skills.goal_spaces import alone
-from skillweave.skills.outputs import Wrapped as Wrapped, answer, called
+from skillweave.skills.outputs import Wrapped, answer, called
 from skillweave.types import Array, Memory, Memoryless, Step
 
 
