@@ -62,7 +62,8 @@ def ours(transitions: int, **kwargs: Any) -> dict[str, float]:
 
     torch.set_num_threads(1)
     before = resident()
-    store = ReplayStore(transitions, NUM_ENVS, 1, SPACE, (), np.int64, mask_size=4, **kwargs)
+    action = np.zeros(1, np.int64)
+    store = ReplayStore(transitions, NUM_ENVS, 1, SPACE, action, choices=4, **kwargs)
     never, ones = np.zeros((1, NUM_ENVS), bool), np.ones((1, NUM_ENVS), np.int64)
 
     def add(obs: Any, true: Any, action: Any, reward: Any, ended: Any) -> None:

@@ -114,9 +114,7 @@ def check_columns(
     in_range = {
         "kind": (kind <= 2).all() and (filled == (newest >= 0)).all(),
         "newest": ((newest >= -1) & (newest < 2**53)).all(),
-        "action": not actions
-        or action.dtype.kind not in "iu"
-        or ((action >= 0) & (action < actions)).all(),
+        "action": not actions or ((action >= 0) & (action < actions)).all(),
         "steps": ((steps >= 1) & (steps < LARGEST_STEPS)).all(),
     }
     for name, x in written.items():

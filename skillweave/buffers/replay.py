@@ -3,90 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
-from numpy.typing import DTypeLike
 from torch import Tensor
 
 from skillweave.algorithms.batches import Batch, Sample
 from skillweave.buffers.priorities import Priorities
 from skillweave.buffers.replay_storage import NOTHING, TERMINATED, Columns, copy_into
-from skillweave.errors import TrainingError
-from skillweave.spaces import ActionCodec, to_tensor
+from skillweave.spaces import to_tensor
 from skillweave.types import Array
-
-
-class Relabel(Protocol):
-    """A judge that gives rows another outcome when they are drawn."""
-
-    raw: tuple[str, ...]
-    """The raw columns of ``SCHEMA`` that the judge needs."""
-
-    def __call__(self, rows: Batch) -> Batch:
-        """Return rows (P·B, n) with other ``reward``, ``terminated`` and ``truncated``."""
-        ...
-
-
-class _Settings(Protocol):
-    """The settings of an off-policy algorithm that a store needs."""
-
-    @property
-    def buffer_size(self) -> int: ...
-    @property
-    def n_step(self) -> int: ...
-    @property
-    def prioritized(self) -> bool: ...
-    @property
-    def priority_alpha(self) -> float: ...
-
-
-def replay_store(
-    config: _Settings,
-    codec: ActionCodec,
-    observation_space: gym.Space[Any],
-    num_envs: int,
-    members: int = 1,
-    *,
-    shared: bool = False,
-    between: bool = False,
-    raw: Sequence[str] = (),
-    relabel: Relabel | None = None,
-    device: str | torch.device = "cpu",
-) -> ReplayStore:
-    """Return an empty replay store for an algorithm's settings.
-
-    A store that is made only to check that it fits costs nothing: unwritten slots take no memory.
-
-    Args:
-        num_envs: of all members together.
-        shared: each member learns from the experience of all; ``buffer_size`` is then their total.
-        between, raw: see ``OffPolicyAlgorithm``.
-        relabel: judges transitions again when they are drawn.
-
-    Raises:
-        TrainingError: the store is larger than the machine's memory.
-        DeclarationError: the store is smaller than one row.
-    """
-    return ReplayStore(
-        config.buffer_size * (1 if shared else members),
-        num_envs,
-        members,
-        observation_space,
-        () if codec.discrete else (codec.size,),
-        np.int64 if codec.discrete else np.float32,
-        mask_size=codec.size if codec.discrete else None,
-        shared=shared,
-        n_step=config.n_step,
-        prioritized=config.prioritized,
-        alpha=config.priority_alpha,
-        between=between,
-        raw=raw,
-        relabel=relabel,
-        device=device,
-    )
 
 
 class ReplayStore:
@@ -94,16 +22,19 @@ class ReplayStore:
 
     The store has N = P·B columns as in ``Batch``. A member draws from its own columns, or with
     ``shared`` from all; each has its own γ. Every end of a trajectory takes the room of a
-    transition.
+    transition. A store that is made only to check that it fits costs nothing: unwritten slots take
+    no memory.
 
     Args:
         capacity: transitions of all columns together.
-        mask_size: number of discrete actions.
+        num_envs: N.
+        members: P.
+        action: an example of actions, (1, …).
+        choices: number of discrete actions; 0: actions are numbers, or have no masks.
+        shared: each member learns from the experience of all.
         n_step, prioritized, alpha: settings of sampling (Schaul et al. 2016).
         between: samples hold the observations between the n steps, too.
         raw: raw columns that are stored; a sample has those that are among its fields.
-        relabel: judges transitions again when they are drawn; None: they keep the reward and the
-            ends that they were stored with. Only for rows of one step.
         device: of the samples.
 
     Raises:
@@ -117,31 +48,20 @@ class ReplayStore:
         num_envs: int,
         members: int,
         observation_space: gym.Space[Any],
-        action_shape: tuple[int, ...],
-        action_dtype: DTypeLike,
+        action: Array,
         *,
-        mask_size: int | None = None,
+        choices: int = 0,
         shared: bool = False,
         n_step: int = 1,
         prioritized: bool = False,
         alpha: float = 0.6,
         between: bool = False,
         raw: Sequence[str] = (),
-        relabel: Relabel | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        needed = (*raw, *(() if relabel is None else relabel.raw))
-        self._relabel = relabel
+        each = 4 * prioritized * (members if shared else 1)
         self._columns = Columns(
-            capacity,
-            num_envs,
-            observation_space,
-            action_shape,
-            action_dtype,
-            mask_size=mask_size,
-            each=4 * prioritized * (members if shared else 1),
-            keep_rewards=shared,
-            raw=tuple(dict.fromkeys(needed)),
+            capacity, num_envs, observation_space, action, choices, each, shared, raw
         )
         self.num_envs = num_envs
         self._n_step = n_step
@@ -211,29 +131,20 @@ class ReplayStore:
         """Return the transitions ``index`` (P, B), perhaps from a sample of another store."""
         columns, data = self._columns, self._columns.data
         factor = gamma.float().cpu().numpy()[:, None]
-        start = index % columns.slots
-        slots, follows = self._chain(start)
-        outcome = None if self._relabel is None else self._judge_again(self._relabel, slots)
-        slot = start
-        goes_on = follows[0]
-        reward = columns.reward(factor, start) if outcome is None else outcome["reward"][..., 0]
-        discount = columns.power(factor, start)
-        terminated: Any = None if outcome is None else outcome["terminated"][..., 0]
+        slot = start = index % columns.slots
+        goes_on = np.ones(start.shape, bool)
+        reward, discount = columns.reward(factor, start), columns.power(factor, start)
         between: list[tuple[Array, Array]] = []
-        for k in range(1, self._n_step):
-            goes_on = goes_on & follows[k]
-            if outcome is not None:
-                goes_on &= ~outcome.ended[..., k - 1]
-            slot = np.where(goes_on, slots[k], slot)
+        for _ in range(1, self._n_step):
+            after = columns.after(slot)
+            goes_on = goes_on & (data["kind"].take(after) != NOTHING)
+            slot = np.where(goes_on, after, slot)
             between.append((slot, np.where(goes_on, discount, np.float32(0))))
-            paid = columns.reward(factor, slot) if outcome is None else outcome["reward"][..., k]
-            reward = reward + np.where(goes_on, discount * paid, np.float32(0))
+            paid = discount * columns.reward(factor, slot)
+            reward = reward + np.where(goes_on, paid, np.float32(0))
             discount = np.where(goes_on, discount * columns.power(factor, slot), discount)
-            if outcome is not None:
-                terminated = np.where(goes_on, outcome["terminated"][..., k], terminated)
         after = columns.after(slot)
-        if terminated is None:
-            terminated = data["kind"].take(slot) == TERMINATED
+        terminated = data["kind"].take(slot) == TERMINATED
         action = data["action"].take(start, axis=0)
         env_reward = data.get("env_reward")
         return Sample(
@@ -250,37 +161,6 @@ class ReplayStore:
             progress=progress,
             **self._between_fields(between),
         )
-
-    def _chain(self, start: Array) -> tuple[list[Array], list[Array]]:
-        """Return the slots (P, B) of n rows from ``start`` on, and where each follows the last.
-
-        A row that does not follow has the slot of the last one that does.
-        """
-        slots = [start]
-        follows = [np.ones(start.shape, bool)]
-        for _ in range(self._n_step - 1):
-            after = self._columns.after(slots[-1])
-            follows.append(self._columns.data["kind"].take(after) != NOTHING)
-            slots.append(np.where(follows[-1], after, slots[-1]))
-        return slots, follows
-
-    def _judge_again(self, relabel: Relabel, slots: Sequence[Array]) -> Batch:
-        """Return the outcome that ``relabel`` gives the n rows of ``slots`` (P, B), (P, B, n)."""
-        columns, data = self._columns, self._columns.data
-        if "steps" in data:
-            raise TrainingError("transitions of several steps cannot be judged again")
-        lead = (*slots[0].shape, len(slots))
-        flat = np.stack(slots, -1).reshape(-1, len(slots))
-        stored = {k: data[k].take(flat, axis=0) for k in ("obs", "action", "reward", *columns.raw)}
-        never = np.zeros(flat.shape, bool)
-        rows = Batch(
-            **stored,
-            next_obs=data["obs"].take(columns.after(flat), axis=0),
-            terminated=never,
-            truncated=never,
-        )
-        judged = relabel(rows)
-        return Batch(**{k: judged[k].reshape(lead) for k in ("reward", "terminated", "truncated")})
 
     def update_priorities(self, index: Array, priority: Tensor, first: int = 0) -> None:
         """Set the priorities (P, B), above 0, of the samples of members from ``first`` on."""

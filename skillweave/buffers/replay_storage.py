@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import DTypeLike
 from torch import Tensor
 
 from skillweave.algorithms.batches import Batch
@@ -35,7 +34,8 @@ class Columns:
     too, until the trajectory goes on. Slots are numbered ``row · N + column``.
 
     Args:
-        mask_size: number of discrete actions.
+        action: an example of actions, (1, …).
+        choices: number of discrete actions; 0: actions are numbers, or have no masks.
         each: bytes that every transition takes elsewhere.
         keep_rewards: store the reward of every step of a call, so that any γ can be applied.
         raw: names of raw columns of ``SCHEMA`` that are stored unchanged, too.
@@ -50,26 +50,24 @@ class Columns:
         capacity: int,
         num_envs: int,
         observation_space: gym.Space[Any],
-        action_shape: tuple[int, ...],
-        action_dtype: DTypeLike,
-        *,
-        mask_size: int | None,
+        action: Array,
+        choices: int,
         each: int,
         keep_rewards: bool,
-        raw: Sequence[str] = (),
+        raw: Sequence[str],
     ) -> None:
         if capacity < num_envs:
             raise DeclarationError(
                 f"buffer_size is {capacity}; it must be at least num_envs, {num_envs}"
             )
-        action = np.dtype(action_dtype)
-        if mask_size is not None and action.kind in "iu":
-            action = np.dtype(next(k for k in INTEGERS if mask_size - 1 <= np.iinfo(k).max))
+        chosen: Any = action.dtype
+        if choices:
+            chosen = next(k for k in INTEGERS if choices - 1 <= np.iinfo(k).max)
         item = obs_dtype(observation_space)
         shape = obs_shape(observation_space)
         kinds: dict[str, tuple[tuple[int, ...], Any]] = {
             "obs": (shape, item),
-            "action": (action_shape, action),
+            "action": (action.shape[1:], chosen),
             "reward": ((), np.float32),
             "kind": ((), np.uint8),
         }
@@ -86,8 +84,7 @@ class Columns:
         """(N,) the newest slot of each column, counted from the first in the run."""
         self._column = np.arange(num_envs)
         self._open = np.zeros(num_envs, bool)  # True where the trajectory goes on
-        self._space = observation_space
-        self._mask_size = mask_size or 0
+        self._space, self._choices = observation_space, choices
         self._keeps_rewards = keep_rewards
         self.raw = tuple(raw)
         # The rewards of calls one after another; "call" holds the first place of a slot's rewards.
@@ -157,7 +154,7 @@ class Columns:
         if "mask" not in self.data:
             return None
         bits = self.data["mask"].take(slot, axis=0)
-        return np.unpackbits(bits, axis=-1, count=self._mask_size).view(bool)
+        return np.unpackbits(bits, axis=-1, count=self._choices).view(bool)
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Restore the arrays that ``written`` of columns with the same arguments returned.
@@ -179,7 +176,7 @@ class Columns:
         self._rewards = np.zeros(max(self._rewards_used, len(self._rewards)), np.float32)
         copy_into({"newest": self.newest}, state)
         copy_into(self.written(), state)
-        check_columns(self.written(), self._space, self._mask_size)
+        check_columns(self.written(), self._space, self._choices)
 
     def written(self) -> dict[str, Array]:
         """Return views of all that was written, by name."""
@@ -255,8 +252,7 @@ class Columns:
         if name == "steps":
             self.data[name] = np.ones(self.slots, np.float32)
         elif name == "mask":
-            assert self._mask_size, "masks need a mask_size"
-            self.data[name] = np.full((self.slots, -(-self._mask_size // 8)), 255, np.uint8)
+            self.data[name] = np.full((self.slots, -(-self._choices // 8)), 255, np.uint8)
         else:
             self.data[name] = np.zeros(self.slots, np.int64)
             self._rewards_used = 0

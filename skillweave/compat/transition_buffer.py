@@ -78,6 +78,4 @@ class TransitionBuffer:
         )
         kind: Any = obs.dtype if whole else np.float32
         space: gym.Space[Any] = gym.spaces.Box(low, high, obs.shape[1:], kind)
-        shape = action.shape[1:]
-        n = len(obs)
-        return ReplayStore(self._capacity, n, 1, space, shape, action.dtype, **self._how)
+        return ReplayStore(self._capacity, len(obs), 1, space, action[:1], **self._how)

@@ -10,16 +10,15 @@ from typing import Any
 import numpy as np
 
 from skillweave._internal.seeding import Seeds, seed_global_generators
-from skillweave.algorithms.batches import INFO, Batch, Trace, padded_last_axis, side_by_side
+from skillweave.algorithms.batches import Batch, Trace, padded_last_axis, side_by_side
 from skillweave.envs.engine import Engine, RawStep, checksums
 from skillweave.envs.infos import info_numbers, reported_success
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.acting import Acting, Request
-from skillweave.experience.judge import judge, seen_by
 from skillweave.experience.learners import Alone, Calling, LevelLearners, OneLearner
 from skillweave.experience.restored import OF_LEARNERS, check_numbers, opened
 from skillweave.experience.search import Search
-from skillweave.experience.views import steps_of, successes_of
+from skillweave.experience.views import OwnSteps, seen_by, stops
 from skillweave.experience.writer import TraceWriter
 from skillweave.policies.core import (
     LIMIT,
@@ -274,7 +273,7 @@ class Collector:
     def _prepare(self, request: Request) -> None:
         """Act by this request from now on."""
         self.learning.begin(request, self.elapsed)
-        self._record, self._greedy = request.record, request.greedy
+        self._greedy = request.greedy
         self._goal_rng = (request.seeds / "goals").numpy()
         rng, last = (request.seeds / "skills").numpy(), self.kept.get("last_action")
         self._world = World(rng, self.kept["age"], last, self.overridden)
@@ -283,7 +282,7 @@ class Collector:
         """Return what writes the trace of ``rows`` steps."""
         skill = self.skill
         reads = skill is not None and any(map(skill.defines, skill.methods))
-        reads |= any(name.startswith(INFO) for name in self._record) or self.learning.reads_infos()
+        reads |= self.learning.reads_infos()
         if self.log_calls is not None and isinstance(self.who, Calling):
             reads |= bool(self.log_calls)
             reads |= any(s.defines("success") for s in self.who.skills.skills)
@@ -408,7 +407,7 @@ class Collector:
                 if self.policy.restricts:
                     end[rows[self.policy.stuck(self.memory, rows, raw.next_obs[rows])]] = LIMIT
                 seen = seen_by(skill, step, elapsed, rows, own_goal)
-                end[rows[judge(skill, seen, rows).stops]] = OWN
+                end[rows[stops(skill, seen, rows)]] = OWN
         over = raw.terminated | raw.truncated
         if self.search is not None:
             over &= ~self.search.kept["searching"]
@@ -424,13 +423,14 @@ class Collector:
             The steps as those who act are judged by them, and the episodes that ended in them:
             row, environments, and numbers (k, 4 + I), as in ``Collected.episodes``.
         """
-        acts, elapsed, goal = trace.valid_rows, trace["elapsed"], trace.get("goal")
-        steps = steps_of(trace, self.skill, acts, elapsed, trace["end"], goal)
+        acts = trace.valid_rows
+        own = OwnSteps(trace, self.skill, acts, trace["elapsed"], trace.get("goal"))
+        steps = own.rows(trace["end"])
         each = np.empty((*trace.lead, 3))
         each[..., 0], each[..., 1], each[..., 2] = steps["reward"], trace["env_reward"] * acts, acts
         found = self._count(each)
         if self.skill is not None and self.skill.defines("success"):
-            success = successes_of(trace, self.skill, acts, elapsed, goal)
+            success = own.judged("success")
             for row, ids, episodes in found:
                 episodes[:, SUCCESS] = success[row, ids]
         return steps, found

@@ -20,13 +20,7 @@ from skillweave.experience.acting import Acting, Request
 from skillweave.experience.calls import OpenCalls
 from skillweave.experience.levels import Level, own_memory, with_learners
 from skillweave.experience.search import Starts
-from skillweave.experience.views import (
-    call_successes,
-    info_numbers_of,
-    rows_of,
-    steps_of,
-    timed_out,
-)
+from skillweave.experience.views import OwnSteps, call_successes, info_numbers_of, rows_of
 from skillweave.experience.writer import TraceWriter
 from skillweave.policies.core import EPISODE, LIMIT, RUNNING, Policy, end_with_episode
 from skillweave.policies.hierarchy import ActiveGuide
@@ -129,7 +123,7 @@ class OneLearner:
         """
         goes_on = steps["valid"] & ~steps.ended
         steps = steps.replace(valid=trace.get("valid"))
-        batch = rows_of(trace, steps, "", trace["elapsed"], self._record, self._goals, self._part)
+        batch = rows_of(trace, steps, "", self._record, self._goals, self._part)
         return {"": _completed(batch, self._space, self._before, goes_on)}
 
 
@@ -317,16 +311,15 @@ class LevelLearners:
     def _of_skill(self, trace: Trace, level: Level, i: int, acts: Array, end: Array) -> Batch:
         """Return what a skill that learns did, judged by its own reward and ends."""
         skill, part, goals = level.skills[i], level.skill_set.part(i), level.hierarchy.goals.get(i)
-        path, elapsed = level.path + skill.name, trace[level.path + "call_elapsed"]
-        goal = trace.get(f"{path}/goal")
-        steps = steps_of(trace, skill, acts, elapsed, end, goal)
+        path, own = level.path + skill.name, OwnSteps.called(trace, level.path, skill, acts)
+        steps = own.rows(end)
         # Elsewhere it is called again at once.
-        ends = trace.ended | timed_out(trace, skill, elapsed)
-        if goal is not None:  # with another goal another trajectory begins
-            other = goal[1:] != goal[:-1]
+        ends = trace.ended | own.timed_out
+        if own.goal is not None:  # with another goal another trajectory begins
+            other = own.goal[1:] != own.goal[:-1]
             ends[:-1] |= other.any(axis=tuple(range(2, other.ndim)))
         steps["truncated"][:-1] &= ends[:-1] | ~acts[1:]
-        batch = rows_of(trace, steps, f"{path}/", elapsed, self._record, goals, part)
+        batch = rows_of(trace, steps, f"{path}/", self._record, goals, part)
         space = self._space if part is None else part.action_space
         return _completed(batch, space, self._states.get(path), acts & ~trace.ended)
 
@@ -335,19 +328,15 @@ class LevelLearners:
         trace: Trace, level: Level, i: int, acts: Array, end: Array
     ) -> tuple[Level, Batch, Array, Array]:
         """Judge a skill that is a hierarchy; return the arguments of ``_of_level`` for it."""
-        skill, below = level.skills[i], level.below[i]
-        elapsed, goal = trace[level.path + "call_elapsed"], trace.get(f"{below.path}goal")
-        steps = steps_of(trace, skill, acts, elapsed, end, goal)
-        own = trace[below.path + "call_end"]
-        limited = steps["truncated"] & timed_out(trace, skill, elapsed)
-        over = trace.ended
-        closes = (own != RUNNING) | over | limited
-        if goal is not None:  # in its next call it decides again
+        below, own = level.below[i], OwnSteps.called(trace, level.path, level.skills[i], acts)
+        steps, over, ended = own.rows(end), trace.ended, trace[below.path + "call_end"]
+        closes = (ended != RUNNING) | over | (steps["truncated"] & own.timed_out)
+        if own.goal is not None:  # in its next call it decides again
             closes |= end != RUNNING
         # The hierarchy's own end cuts the calls below it, unless it is called again at once.
-        cut = (own == RUNNING) & (end != RUNNING)
+        cut = (ended == RUNNING) & (end != RUNNING)
         inner = np.where(over, np.int8(EPISODE), np.int8(LIMIT))
-        return below, steps, np.where(cut, inner, own), acts & (closes | steps["terminated"])
+        return below, steps, np.where(cut, inner, ended), acts & (closes | steps["terminated"])
 
 
 def _completed(

@@ -18,7 +18,7 @@ from skillweave._internal.paths import join
 from skillweave.algorithms.batches import INFO, OF_STEP, Batch, Trace
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
-from skillweave.experience.views import call_successes, info_numbers_of, judged
+from skillweave.experience.views import OwnSteps, call_successes, info_numbers_of
 from skillweave.experience.writer import TraceWriter
 from skillweave.planning.calls import CallLog, seen_places, skill_checksums, skill_code
 from skillweave.planning.columns import GOAL, PER_CALL, PER_STEP, call_fields
@@ -322,8 +322,8 @@ class Recorder:
             if isinstance(skill, RecordedSkill):
                 own[acts] = np.nan
             elif skill.defines("reward") and acts.any():
-                goal = trace.get(f"{self._columns}{skill.name}/goal")
-                own[acts] = judged(trace, skill, "reward", acts, elapsed, goal)
+                steps = OwnSteps.called(trace, self._columns, skill, acts)
+                own[acts] = steps.judged("reward")[acts]
         np.add.at(calls["own_return"], at[mine], own[mine])
         calls["last_reward"][at[over]] = own[over]
         endless = mine & self.endless[running]

@@ -24,7 +24,7 @@ from torch import Tensor
 from skillweave._internal import interrupts
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.batches import Batch
-from skillweave.experience.source import Source
+from skillweave.experience.group import Collectors
 from skillweave.ops.device import INT
 from skillweave.ops.threads import WorkThread, torch_threads
 from skillweave.spaces import to_tensor
@@ -116,7 +116,7 @@ OnCalls = Callable[[Batch], None]
 
 def train(
     learner: Learner,
-    collectors: Source,
+    collectors: Collectors,
     episodes: Episodes,
     seeds: Seeds,
     budget: int,
@@ -182,7 +182,7 @@ class _Loop:
     def __init__(
         self,
         learner: Learner,
-        collectors: Source,
+        collectors: Collectors,
         episodes: Episodes,
         seeds: Seeds,
         at: Progress,
@@ -320,7 +320,7 @@ class _Loop:
 
 def resume(
     learner: Learner,
-    collectors: Source,
+    collectors: Collectors,
     episodes: Episodes,
     saved: dict[str, Tensor],
     at: Progress,
@@ -344,7 +344,7 @@ def resume(
 
 def begin_episodes(
     learner: Learner,
-    collectors: Source,
+    collectors: Collectors,
     saved: dict[str, Tensor],
     at: Progress,
     seeds: Seeds,

@@ -11,7 +11,7 @@ import numpy as np
 
 from skillweave._internal.paths import AGENT, join, level_of, names_in
 from skillweave.envs.make import EnvSpec
-from skillweave.experience.judge import judge, seen_by
+from skillweave.experience.views import seen_by, stops
 from skillweave.planning.calls import CallLog
 from skillweave.planning.columns import GOAL, OF_CALL
 from skillweave.planning.recorder import SUMS, Recorder, TraceFeed, calls_in, goals_in, levels_below
@@ -180,9 +180,8 @@ class PlayedCalls:
             end[tau >= skill.max_steps] = LIMIT
         if len(runs):
             own = None if goal is None else goal[runs]
-            end[
-                runs[judge(skill, seen_by(skill, step, tau[runs], runs, own), rows[runs]).stops]
-            ] = OWN
+            seen = seen_by(skill, step, tau[runs], runs, own)
+            end[runs[stops(skill, seen, rows[runs])]] = OWN
         end_with_episode(end, played.over & ~played.cut)
         end[played.cut & (end == RUNNING)] = EPISODE
         self._tau[rows] = np.where(end == RUNNING, tau, IS_DONE)

@@ -13,7 +13,7 @@ from torch import Tensor
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.batches import Batch
-from skillweave.buffers.replay import Relabel, ReplayStore, replay_store
+from skillweave.buffers.replay import ReplayStore
 from skillweave.experience.acting import ActionRepeat, Request
 from skillweave.ops.device import resolve_device
 from skillweave.spaces import to_tensor
@@ -38,7 +38,7 @@ class ReplayLearner:
     counts transitions, of which a selector has one for each decision.
 
     Args:
-        store: made by ``replay_store``.
+        store: made by ``store_of``.
         row_steps: approximate environment steps of a row; a selector's calls have several.
         goes_on_at: environment steps of the stage so far.
     """
@@ -251,35 +251,33 @@ def check_counts(kept: dict[str, Tensor], num_envs: int) -> None:
 
 
 def store_of(
-    algorithm: Any,
-    num_envs: int,
-    members: int = 1,
-    *,
-    shared: bool = False,
-    relabel: Relabel | None = None,
+    algorithm: Any, num_envs: int, members: int = 1, *, shared: bool = False
 ) -> ReplayStore:
     """Return an empty replay store for an algorithm's samples.
 
     Args:
         num_envs: of all members together.
         shared: each member learns from the experience of all.
-        relabel: judges transitions again when they are drawn.
 
     Raises:
         TrainingError: the store is larger than the machine's memory.
         DeclarationError: the store is smaller than one row.
     """
-    return replay_store(
-        algorithm.config,
-        algorithm.codec,
-        algorithm.observation_space,
+    config, codec = algorithm.config, algorithm.codec
+    return ReplayStore(
+        config.buffer_size * (1 if shared else members),
         num_envs,
         members,
+        algorithm.observation_space,
+        codec.zeros(1),
+        choices=codec.size if codec.discrete else 0,
         shared=shared,
+        n_step=config.n_step,
+        prioritized=config.prioritized,
+        alpha=config.priority_alpha,
         between=algorithm.between,
         raw=algorithm.raw,
-        relabel=relabel,
-        device=resolve_device(algorithm.config.device),
+        device=resolve_device(config.device),
     )
 
 

@@ -11,11 +11,13 @@ from plain_replay import SPACE, A, World
 
 from skillweave.algorithms.batches import Batch, Sample
 from skillweave.buffers import ram
-from skillweave.buffers.replay import ReplayStore, replay_store
+from skillweave.buffers.replay import ReplayStore
 from skillweave.errors import SkillweaveError
 from skillweave.spaces import action_codec, obs_dtype
+from skillweave.training.replay_learner import store_of
 
 GAMMA = torch.tensor([0.9, 0.5, 0.99])
+CHOICE = np.zeros(1, np.int64)
 
 
 def generators(members: int, seed: int = 0) -> list[np.random.Generator]:
@@ -30,7 +32,7 @@ def same(a: Sample, b: Sample) -> bool:
 
 
 def make(capacity: int, num_envs: int = 1, members: int = 1, **kwargs) -> ReplayStore:
-    return ReplayStore(capacity, num_envs, members, SPACE, (), np.int64, mask_size=A, **kwargs)
+    return ReplayStore(capacity, num_envs, members, SPACE, CHOICE, choices=A, **kwargs)
 
 
 # One column by hand: observations are the time, the true successor of an ended step is t + 0.5
@@ -263,7 +265,7 @@ def rows_of(obs, action, after, truncated=None) -> Batch:
 
 def test_boxes_of_actions_stay_as_they_are_and_choices_become_int64():
     action, obs = np.random.default_rng(0).random((2, 3), dtype=np.float32), np.zeros((2, 2))
-    boxes = ReplayStore(10, 2, 2, SPACE, (3,), np.float32)
+    boxes = ReplayStore(10, 2, 2, SPACE, action[:1])
     boxes.add(rows_of(obs, action, obs))
     sample = boxes.sample(1, GAMMA[:2], generators(2))
     assert torch.equal(sample.action[:, 0], torch.from_numpy(action))
@@ -271,7 +273,7 @@ def test_boxes_of_actions_stay_as_they_are_and_choices_become_int64():
     assert sample.next_mask is None
     assert sample.weight is None
     for choices, bytes_each in (256, 1), (257, 2), (40_000, 4):
-        store = ReplayStore(10, 2, 2, SPACE, (), np.int64, mask_size=choices)
+        store = ReplayStore(10, 2, 2, SPACE, CHOICE, choices=choices)
         store.add(rows_of(obs, np.array([0, choices - 1]), obs))
         sample = store.sample(1, GAMMA[:2], generators(2))
         assert sample.action.dtype == torch.int64
@@ -287,7 +289,7 @@ def test_structured_observations_become_bytes():
     first, true = (np.zeros(2, kind) for _ in range(2))
     for obs in (first, true):
         obs["far"], obs["near"] = rng.random((2, 2)), rng.integers(7, size=2)
-    store, other = (ReplayStore(6, 2, 2, space, (), np.int64, mask_size=A) for _ in range(2))
+    store, other = (ReplayStore(6, 2, 2, space, CHOICE, choices=A) for _ in range(2))
     store.add(rows_of(first, np.zeros(2), true, np.array([False, True])))
     other.load(store.state())
     for b in store, other:
@@ -346,7 +348,7 @@ def test_a_state_without_masks_and_calls_replaces_one_with_them(prioritized):
 def test_a_checkpoint_of_other_settings_is_refused():
     state = line([1, 2, 4], capacity=8).state()
     with pytest.raises(SkillweaveError) as error:
-        ReplayStore(8, 1, 1, gym.spaces.Box(-1, 1, (3,)), (), np.int64).load(state)
+        ReplayStore(8, 1, 1, gym.spaces.Box(-1, 1, (3,)), CHOICE).load(state)
     assert str(error.value) == (
         "the checkpoint's replay buffer does not fit: 'obs' is torch.float32 (4, 2), where "
         "torch.float32 (4, 3) belongs; continue with the settings that it was written with, or "
@@ -364,9 +366,7 @@ def test_a_checkpoint_of_other_settings_is_refused():
 def test_a_million_lunar_lander_transitions_take_at_most_90_megabytes():
     space = gym.spaces.Box(-1, 1, (8,), np.float32)
     for prioritized in False, True:
-        store = ReplayStore(
-            1_000_000, 16, 1, space, (), np.int64, mask_size=4, prioritized=prioritized
-        )
+        store = ReplayStore(1_000_000, 16, 1, space, CHOICE, choices=4, prioritized=prioritized)
         assert store.nbytes <= (43e6 if prioritized else 39e6)
         e = rows_of(np.zeros((16, 8)), np.zeros(16), np.zeros((16, 8)))
         e["steps"][:] = 2
@@ -375,13 +375,12 @@ def test_a_million_lunar_lander_transitions_take_at_most_90_megabytes():
 
 
 def test_more_than_the_memory_is_an_error_that_says_how_much_would_fit():
-    config = SimpleNamespace(buffer_size=1_000_000, n_step=1, prioritized=False, priority_alpha=0.6)
-    space, codec = gym.spaces.Box(0, 255, (4, 84, 84), np.uint8), gym.spaces.Discrete(6)
+    space = gym.spaces.Box(0, 255, (4, 84, 84), np.uint8)
     with (
         mock.patch.object(ram, "free_memory", return_value=int(11.2 * 2**30)),
         pytest.raises(SkillweaveError) as error,
     ):
-        replay_store(config, action_codec(codec), space, num_envs=8)
+        ReplayStore(1_000_000, 8, 1, space, CHOICE, choices=6)
     assert str(error.value) == (
         "a replay buffer of 1,000,000 transitions of (4, 84, 84) uint8 needs 26.3 GiB, "
         "but 11.2 GiB are free: lower buffer_size (at most about 425,997)"
@@ -415,9 +414,14 @@ def test_the_room_for_rewards_of_calls_counts_as_well():
     ("shared", "members", "most"), [(False, 1, 10), (False, 3, 30), (True, 3, 9)]
 )
 def test_a_store_is_made_from_an_algorithms_settings(shared, members, most):
-    config = SimpleNamespace(buffer_size=10, n_step=3, prioritized=True, priority_alpha=0.5)
     box = action_codec(gym.spaces.Box(-1, 1, (2,)))
-    store = replay_store(config, box, SPACE, members, members, shared=shared, between=True)
+    config = SimpleNamespace(
+        buffer_size=10, n_step=3, prioritized=True, priority_alpha=0.5, device="cpu"
+    )
+    algorithm = SimpleNamespace(
+        config=config, codec=box, observation_space=SPACE, between=True, raw=()
+    )
+    store = store_of(algorithm, members, members, shared=shared)
     action = np.zeros((members, 2), np.float32)
     for _ in range(20):
         store.add(rows_of(np.zeros((members, 2)), action, np.zeros((members, 2))))
