@@ -27,9 +27,8 @@ from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from skillweave._internal.messages import error_text
 from skillweave.errors import TrainingError, make_error
-from skillweave.experience.collector import Collected
 from skillweave.workers.actor_host import COMPUTING, actor_class
-from skillweave.workers.host import WorkerCollectors, WorkerFactory, WorkerLost, Workers
+from skillweave.workers.host import Worker, WorkerFactory, WorkerLost
 from skillweave.workers.shipping import packed
 
 PATIENCE = 1.0
@@ -130,51 +129,7 @@ class Actors:
         self._waited, self._told = 0.0, False
 
 
-class RayWorkers(Workers):
-    """Workers, each in an actor."""
-
-    tries = 5  # one may be made again on a node of which Ray does not know yet that it is lost
-    _workers: list[ActorWorker]  # type: ignore[assignment]
-
-    def close(self) -> None:
-        """Let the actors close their environments; end those that do not."""
-        self._workers[0].let_close()
-
-
-def ray_workers(actors: Actors, make: WorkerFactory, count: int, name: str) -> Workers:
-    """``count`` workers in actors; ``make`` is given 1 and the worker's number."""
-    return RayWorkers(_workers(actors, make, 1, count, name), name)
-
-
-class RayCollectors(RayWorkers, WorkerCollectors):
-    """W collectors, each in an actor.
-
-    Args:
-        actors: where.
-        make: makes one; it is sent to the nodes with the user's code that it needs.
-        each: environments of a collector.
-        count: W.
-        members: P.
-        name: what messages call the environment.
-
-    Raises:
-        TrainingError: a node has another version of Skillweave or Python, or there is no room.
-    """
-
-    def __init__(
-        self, actors: Actors, make: WorkerFactory, each: int, count: int, members: int, name: str
-    ) -> None:
-        super().__init__(_workers(actors, make, each, count, name), each, members, name)
-
-    def _shared(self, task: Any) -> Sequence[Any]:
-        return [_put(task)] * len(self._workers)
-
-    def _joined(self, found: Sequence[Collected]) -> Collected:
-        # Arrays of the object store cannot be written to; joining several copies them.
-        return super()._joined(found if len(found) > 1 else deepcopy(found))
-
-
-class ActorWorker:
+class ActorWorker(Worker):
     """A collector in an actor.
 
     Args:
@@ -182,10 +137,14 @@ class ActorWorker:
         code: what makes the collector, packed, in the object store.
         each: its environments.
         number: of the worker, and of its actor.
+        alone: no answers of other workers are joined with its own.
     """
 
-    def __init__(self, actors: Actors, code: Any, each: int, number: int) -> None:
+    tries = 5  # one may be made again on a node of which Ray does not know yet that it is lost
+
+    def __init__(self, actors: Actors, code: Any, each: int, number: int, alone: bool) -> None:
         self._actors, self._code, self._each, self._number = actors, code, each, number
+        self._alone = alone
         self._due, self._lost = deque[Any](), ""
         self.place: dict[str, Any] = {}
         """Its node and process, and what runs there."""
@@ -221,23 +180,37 @@ class ActorWorker:
             raise _full(full) from full
         if error is not None:
             raise make_error(*error)
-        return answer
-
-    def let_close(self) -> None:
-        """Let all actors close their environments."""
-        self._actors.let_close()
+        # Arrays of the object store cannot be written to; joining several copies them.
+        return deepcopy(answer) if self._alone else answer
 
     def release(self) -> None:
         """End the actor."""
         self._due.clear()
         self._actors.end(self._number)
 
+    def release_all(self, workers: Sequence[Any]) -> None:
+        """Let the actors close their environments; end those that do not."""
+        self._actors.let_close()
 
-def _workers(
+    def shared(self, task: Any) -> Any:
+        """Return a reference to the task in the object store."""
+        return _put(task)
+
+
+def actor_workers(
     actors: Actors, make: WorkerFactory, each: int, count: int, name: str
 ) -> list[ActorWorker]:
+    """Return workers in actors; ``make`` is sent to the nodes with the user's code that it needs.
+
+    Args:
+        actors: where.
+        make: makes the collector of each.
+        each: environments of a worker.
+        count: W.
+        name: what messages call the environment.
+    """
     code = _put(packed(make, f"what collectors of {name} are made of"))
-    return [ActorWorker(actors, code, each, i) for i in range(count)]
+    return [ActorWorker(actors, code, each, i, count == 1) for i in range(count)]
 
 
 def _put(thing: Any) -> Any:

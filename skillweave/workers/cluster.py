@@ -15,7 +15,7 @@ from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, TrainingError, needs_extra
 from skillweave.experience.group import Collectors, MakeCollector, share_of
 from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, settings
-from skillweave.workers.host import WorkerFactory, Workers
+from skillweave.workers.host import WorkerCollectors, WorkerFactory, Workers
 from skillweave.workers.placement import Placement
 
 PATIENCE = 5.0
@@ -103,7 +103,7 @@ class Ray:
             SkillweaveError: the kinds of ``joined``.
         """
         with self.joined(most):
-            from skillweave.workers.actors import Actors, RayCollectors, ray_workers
+            from skillweave.workers.actors import Actors, actor_workers
 
             actors = Actors(most, self.cpus, self.patience, tell)
 
@@ -111,10 +111,11 @@ class Ray:
                 make: MakeCollector, num_envs: int, workers: int, members: int, name: str
             ) -> Collectors:
                 each = share_of(num_envs, workers, members, name)
-                return RayCollectors(actors, make, each, workers, members, name)
+                elsewhere = actor_workers(actors, make, each, workers, name)
+                return WorkerCollectors(elsewhere, each, members, name)
 
             def make_workers(make: WorkerFactory, count: int, name: str) -> Workers:
-                return ray_workers(actors, make, count, name)
+                return Workers(actor_workers(actors, make, 1, count, name), name)
 
             try:
                 yield Placement(make_collectors, make_workers)

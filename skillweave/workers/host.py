@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -47,12 +47,17 @@ class WorkerLost(Exception):
     """A worker's process or machine is no more; the message says what became of it."""
 
 
-class Worker(Protocol):
+class Worker:
     """Somebody elsewhere who has a collector: it does one task after another."""
+
+    tries = 1
+    """How often a lost one is made again before a request fails."""
+    who = ""
+    """Its name in messages; ``Workers`` gives it."""
 
     def begin(self) -> None:
         """Have the collector made; ``receive`` then gives None."""
-        ...
+        raise NotImplementedError
 
     def send(self, what: str, task: Any) -> None:
         """Ask for something; see ``WorkerHost.answer``.
@@ -60,7 +65,7 @@ class Worker(Protocol):
         Raises:
             WorkerLost: it has ended.
         """
-        ...
+        raise NotImplementedError
 
     def receive(self) -> Any:
         """Return the answer to the oldest task that has none.
@@ -69,11 +74,20 @@ class Worker(Protocol):
             WorkerLost: it has ended.
             SkillweaveError: the collector failed; the kind and the message are those of its error.
         """
-        ...
+        raise NotImplementedError
 
     def release(self) -> None:
         """End it, if it has not ended."""
-        ...
+        raise NotImplementedError
+
+    def release_all(self, workers: Sequence[Any]) -> None:
+        """End workers of its kind, itself among them."""
+        for worker in workers:
+            worker.release()
+
+    def shared(self, task: Any) -> Any:
+        """Return a task as it is sent to several workers of its kind."""
+        return task
 
 
 class WorkerHost:
@@ -100,7 +114,7 @@ class WorkerHost:
         return found
 
 
-class LocalWorker:
+class LocalWorker(Worker):
     """A worker in this thread: it does a task when it is asked for the answer.
 
     Args:
@@ -140,7 +154,7 @@ class Workers:
     """Workers that are asked side by side; those that are lost are made again.
 
     Args:
-        workers: W of them.
+        workers: W of them, of one kind.
         name: what messages call the environment.
 
     Raises:
@@ -148,11 +162,10 @@ class Workers:
         TrainingError: a worker was lost again and again at the same place; the message names it.
     """
 
-    tries = 1
-    """How often lost workers are made again before a request fails."""
-
     def __init__(self, workers: Sequence[Worker], name: str) -> None:
-        self._workers, self._name = list(workers), name
+        self._workers = list(workers)
+        for number, worker in enumerate(workers):
+            worker.who = f"{name}: worker {number}{self._whose(number)}"
         self._past: list[tuple[str, Sequence[Any]]] = []
         """What brings workers to where they stand: a start or states, then tasks."""
         try:
@@ -187,16 +200,16 @@ class Workers:
 
     def close(self) -> None:
         """End the workers."""
-        for worker in self._workers:
-            worker.release()
+        self._workers[0].release_all(self._workers)
 
     def _completed(
         self, found: dict[int, Any], path: Sequence[tuple[str, Sequence[Any]]]
     ) -> list[Any]:
         """Return the answers of all workers; those that are not in ``found`` are recreated."""
-        for tried in range(self.tries):
+        tries = self._workers[0].tries
+        for tried in range(1, tries + 1):
             if lost := [i for i in range(len(self._workers)) if i not in found]:
-                found |= self._again(lost, path, must=tried == self.tries - 1)
+                found |= self._again(lost, path, must=tried == tries)
         return [found[i] for i in range(len(self._workers))]
 
     def _again(
@@ -235,16 +248,11 @@ class Workers:
                 found[i] = self._workers[i].receive()
             except WorkerLost as lost:
                 if must:
-                    raise self._failed(i, lost) from None
+                    again = f"{self._workers[i].who} {lost}, and again when it was made again"
+                    raise TrainingError(again) from None
             except SkillweaveError as error:
                 raise reworded(error, f"{error} (in worker {i})") from error
         return found
-
-    def _failed(self, number: int, lost: WorkerLost) -> TrainingError:
-        return TrainingError(
-            f"{self._name}: worker {number}{self._whose(number)} {lost}, and again when it was "
-            "made again"
-        )
 
     def _whose(self, number: int) -> str:
         """Describe a worker's environments for messages."""
@@ -273,11 +281,12 @@ class WorkerCollectors(Workers, Collectors):
     def start(self, seeds: Seeds) -> None:
         """Start every environment, unless they have started."""
         if not self._past:
-            self.ask("start", self._divided(seeds))
+            self.ask("start", [seeds / number for number in range(len(self._workers))])
 
     def collect(self, request: Request) -> Collected:
         """``request.rows`` steps of each environment."""
-        answers: list[Collected] = self.ask("collect", self._shared(request))
+        task = self._workers[0].shared(request)
+        answers: list[Collected] = self.ask("collect", [task] * len(self._workers))
         self._stands = [answer.stands for answer in answers]  # type: ignore[misc]
         found = replace(self._joined(answers), begun_anew=self.differing())
         if len(self._past) > SNAPSHOT_EVERY:
@@ -306,19 +315,6 @@ class WorkerCollectors(Workers, Collectors):
         self.begun_anew += len(found)
         return found
 
-    def _shared(self, task: Any) -> Sequence[Any]:
-        """Return a task for each worker, where all get the same."""
-        return [task] * len(self._workers)
-
-    def _divided(self, seeds: Seeds) -> list[Seeds]:
-        """Seeds of each worker's own."""
-        return [seeds / number for number in range(len(self._workers))]
-
     def _whose(self, number: int) -> str:
-        return environments_of(number, self._each)
-
-
-def environments_of(number: int, each: int) -> str:
-    """Return which environments a worker has, for messages."""
-    first = number * each
-    return f" (environments {first} to {first + each - 1})"
+        first = number * self._each
+        return f" (environments {first} to {first + self._each - 1})"

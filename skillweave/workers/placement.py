@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from skillweave._internal.notices import notice
 from skillweave.experience.group import Collectors, MakeCollector, share_of
-from skillweave.workers.host import LocalWorker, WorkerFactory, Workers
-from skillweave.workers.processes import ProcessCollectors, process_workers
+from skillweave.workers.host import LocalWorker, WorkerCollectors, WorkerFactory, Workers
+from skillweave.workers.processes import ProcessWorker
 from skillweave.workers.start_methods import runs_again, why_no_processes
 
 MakeCollectors = Callable[[MakeCollector, int, int, int, str], Collectors]
@@ -35,7 +35,8 @@ def make_collectors(
             f"{name}: its {workers} collectors work in this process, one after another, as {why}"
         )
         return Collectors([make(each, i * each) for i in range(workers)], members)
-    return ProcessCollectors(make, each, workers, members, name)
+    apart = [ProcessWorker(make, each, i) for i in range(workers)]
+    return WorkerCollectors(apart, each, members, name)
 
 
 MakeWorkers = Callable[[WorkerFactory, int, str], Workers]
@@ -55,7 +56,7 @@ def _processes(make: WorkerFactory, count: int, name: str) -> Workers:
     if why := why_no_processes() or runs_again():
         notice(f"{name}: its {count} parts work in this process, one after another, as {why}")
         return Workers([LocalWorker(make, 1, i) for i in range(count)], name)
-    return process_workers(make, count, name)
+    return Workers([ProcessWorker(make, 1, i) for i in range(count)], name)
 
 
 LOCAL = Placement(make_collectors, _processes)

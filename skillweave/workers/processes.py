@@ -21,13 +21,7 @@ from skillweave._internal.messages import error_text
 from skillweave._internal.notices import notice
 from skillweave.errors import TrainingError, make_error
 from skillweave.workers.channel import Channel, channels
-from skillweave.workers.host import (
-    WorkerCollectors,
-    WorkerFactory,
-    WorkerLost,
-    Workers,
-    environments_of,
-)
+from skillweave.workers.host import Worker, WorkerFactory, WorkerLost
 from skillweave.workers.shipping import packed, unpacked
 from skillweave.workers.start_methods import GUARD
 from skillweave.workers.worker_process import TorchModes, end_group, work
@@ -53,18 +47,17 @@ class _Maker:
         self.make = unpacked(data)
 
 
-class ProcessWorker:
+class ProcessWorker(Worker):
     """A collector in a process.
 
     Args:
         make: makes the collector.
         each: number of its environments.
         number: the worker's number.
-        who: its name in messages.
     """
 
-    def __init__(self, make: WorkerFactory, each: int, number: int, who: str) -> None:
-        self._make, self._each, self._number, self._who = make, each, number, who
+    def __init__(self, make: WorkerFactory, each: int, number: int) -> None:
+        self._make, self._each, self._number = make, each, number
         self._context: Any = mp.get_context()
         self._modes = TorchModes.here()
         self.process: Any = None
@@ -83,7 +76,7 @@ class ProcessWorker:
             _in_starter(self._start)
         except OSError as error:
             raise TrainingError(
-                f"{self._who} could not be started: {error_text(error)}. The system limits "
+                f"{self.who} could not be started: {error_text(error)}. The system limits "
                 "descriptors (ulimit -n), processes (ulimit -u) and memory: raise the limit, or "
                 "have fewer processes, EnvSpec(workers=...)"
             ) from error
@@ -123,7 +116,7 @@ class ProcessWorker:
             raise WorkerLost(self._end()) from None
         except Exception as error:
             raise TrainingError(
-                f"{self._who}: its next task ({self._asked}) could not be sent: {error_text(error)}"
+                f"{self.who}: its next task ({self._asked}) could not be sent: {error_text(error)}"
             ) from error
 
     def receive(self) -> Any:
@@ -155,7 +148,29 @@ class ProcessWorker:
 
     def release(self) -> None:
         """Let the process close its environments; end it if it does not."""
-        close_all([self])
+        self.release_all([self])
+
+    def release_all(self, workers: Sequence[ProcessWorker]) -> None:
+        """Let workers close their environments, all at once; end those that do not."""
+        for worker in workers:
+            if worker.channel is not None:
+                with suppress(OSError):
+                    worker.channel.send(("close", None))
+        for end, seconds in (("join", PATIENCE), ("terminate", PATIENCE / 2), ("kill", DYING)):
+            until = monotonic() + seconds
+            for worker in workers:
+                process = worker.process
+                if process is None or process.pid is None:
+                    continue
+                if end != "join" and process.is_alive():
+                    getattr(process, end)()
+                process.join(max(0.0, until - monotonic()))
+        for worker in workers:
+            if worker.process is not None and worker.process.exitcode:
+                end_group(worker.process.pid)  # it was killed before its environments were closed
+        for worker in workers:
+            _tell_last(worker)
+            worker.forget()
 
     def forget(self) -> None:
         """Close its pipe and release its shared memory."""
@@ -171,7 +186,7 @@ class ProcessWorker:
         if self._told or monotonic() - self._since < self._silence:
             return
         notice(
-            f"{self._who} (process {self.process.pid}) has not answered for {self._silence:.0f} s; "
+            f"{self.who} (process {self.process.pid}) has not answered for {self._silence:.0f} s; "
             f"it is {self._asked}. If its environments are not as slow as that, one of them hangs: "
             f"py-spy dump --pid {self.process.pid} shows where. Ctrl-C stops the run"
         )
@@ -258,29 +273,6 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_start)
 
 
-def close_all(workers: Sequence[ProcessWorker]) -> None:
-    """Let workers close their environments, all at once; end those that do not."""
-    for worker in workers:
-        if worker.channel is not None:
-            with suppress(OSError):
-                worker.channel.send(("close", None))
-    for end, seconds in (("join", PATIENCE), ("terminate", PATIENCE / 2), ("kill", DYING)):
-        until = monotonic() + seconds
-        for worker in workers:
-            process = worker.process
-            if process is None or process.pid is None:
-                continue
-            if end != "join" and process.is_alive():
-                getattr(process, end)()
-            process.join(max(0.0, until - monotonic()))
-    for worker in workers:
-        if worker.process is not None and worker.process.exitcode:
-            end_group(worker.process.pid)  # it was killed before its environments were closed
-    for worker in workers:
-        _tell_last(worker)
-        worker.forget()
-
-
 def _tell_last(worker: ProcessWorker) -> None:
     """Give the notices that a worker sent while it closed its environments."""
     channel = worker.channel
@@ -288,38 +280,3 @@ def _tell_last(worker: ProcessWorker) -> None:
         while channel is not None and channel.pipe.poll():
             for text in channel.receive()[2]:
                 notice(text)
-
-
-class ProcessWorkers(Workers):
-    """Workers, each in a process."""
-
-    _workers: list[ProcessWorker]  # type: ignore[assignment]
-
-    def close(self) -> None:
-        """Let the workers close their environments; end those that do not."""
-        close_all(self._workers)
-
-
-def process_workers(make: WorkerFactory, count: int, name: str) -> Workers:
-    """Return ``count`` workers in processes; ``make`` is called with 1 and the worker's number."""
-    workers = [ProcessWorker(make, 1, i, f"{name}: worker {i}") for i in range(count)]
-    return ProcessWorkers(workers, name)
-
-
-class ProcessCollectors(ProcessWorkers, WorkerCollectors):
-    """W collectors, each in a process.
-
-    Args:
-        make: makes one.
-        each: number of environments of a worker.
-        count: W.
-        members: P.
-        name: the environment's name in messages.
-    """
-
-    def __init__(self, make: WorkerFactory, each: int, count: int, members: int, name: str) -> None:
-        workers = [
-            ProcessWorker(make, each, i, f"{name}: worker {i}{environments_of(i, each)}")
-            for i in range(count)
-        ]
-        super().__init__(workers, each, members, name)

@@ -25,7 +25,7 @@ from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.training.learning_task import skill_task
 from skillweave.training.role import agent_role
-from skillweave.workers.host import WorkerHost, Workers
+from skillweave.workers.host import LocalWorker, Workers
 from skillweave.workers.placement import Placement, make_collectors
 
 SMALL = PPO(num_envs=2, n_steps=16, batch_size=16, update_epochs=1, network=Network((8, 6)))
@@ -65,27 +65,8 @@ class Walk(gym.Env[Any, Any]):
         return self.obs
 
 
-class HereWorker:
-    """A worker in this thread."""
-
-    def __init__(self, make: Any, number: int) -> None:
-        self.make, self.number = make, number
-
-    def begin(self) -> None:
-        self.station, self.answers = WorkerHost(self.make, 1, self.number), list[Any]([None])
-
-    def send(self, what: str, task: Any) -> None:
-        self.answers.append(self.station.answer(what, task))
-
-    def receive(self) -> Any:
-        return self.answers.pop(0)
-
-    def release(self) -> None:
-        self.station.collector.close()
-
-
 def workers_here(make: Any, count: int, name: str) -> Workers:
-    return Workers([HereWorker(make, i) for i in range(count)], name)
+    return Workers([LocalWorker(make, 1, i) for i in range(count)], name)
 
 
 @pytest.fixture

@@ -41,7 +41,7 @@ from skillweave.training.learning_task import skill_task
 from skillweave.training.loop import Progress, Saved
 from skillweave.training.replay_learner import learner_of
 from skillweave.training.role import agent_role
-from skillweave.workers.processes import ProcessCollectors
+from skillweave.workers.placement import make_collectors
 
 CONFIG = PPO(
     num_envs=16, n_steps=16, batch_size=64, update_epochs=4, learning_rate=5e-3, gamma=0.9,
@@ -380,8 +380,9 @@ def test_environments_in_processes_teach_the_same_as_in_this_one_though_workers_
         return found.state.params
 
     here = weights(Collectors([collector(2, 0), collector(2, 2)]))
-    assert torch.equal(here, weights(ProcessCollectors(collector, 2, 2, 1, "CartPole-v1")))
-    assert torch.equal(here, weights(ProcessCollectors(collector, 2, 2, 1, "CartPole-v1"), True))
+    for dies in (False, True):
+        apart = make_collectors(collector, 4, 2, 1, "CartPole-v1")
+        assert torch.equal(here, weights(apart, dies))
 
 
 def test_what_a_lost_worker_did_not_repeat_is_cut_before_rows_of_it_are_kept():

@@ -25,7 +25,6 @@ from skillweave.errors import SkillweaveError
 from skillweave.experience.group import Collectors
 from skillweave.workers import processes, worker_process
 from skillweave.workers.placement import make_collectors
-from skillweave.workers.processes import ProcessCollectors
 
 
 def here(make):
@@ -36,8 +35,8 @@ def here(make):
 def in_processes():
     made = []
 
-    def of(make, each=3, count=2):
-        made.append(ProcessCollectors(make, each, count, 1, "Walk"))
+    def of(make):
+        made.append(make_collectors(make, 6, 2, 1, "Walk"))
         return made[-1]
 
     yield of
@@ -154,10 +153,10 @@ PARENT = """
 import os, signal, time
 from skillweave.workers import processes
 from skillweave.workers import worker_process
-from test_process_collectors import ProcessCollectors, stepping
+from test_process_collectors import make_collectors, stepping
 tasks = worker_process._tasks
 worker_process._tasks = lambda channel: (time.sleep(0.5), tasks(channel))[1]  # no parent by then
-found = ProcessCollectors(stepping(), 1, 3, 1, "Walk")
+found = make_collectors(stepping(), 3, 3, 1, "Walk")
 pids = [worker.process.pid for worker in found._workers]
 os.kill(pids[-1], signal.SIGSTOP)
 print(*pids, flush=True)
@@ -268,7 +267,7 @@ def left_behind():
 
 def test_nothing_is_left_behind():
     def killed_once():
-        collectors = ProcessCollectors(stepping(), 3, 2, 1, "Walk")
+        collectors = make_collectors(stepping(), 6, 2, 1, "Walk")
         collectors.start(Seeds(0))
         collectors.collect(next(requests(30)))
         os.kill(collectors._workers[1].process.pid, signal.SIGKILL)

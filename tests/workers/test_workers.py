@@ -16,7 +16,7 @@ from toys import alone_in
 from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
-from skillweave.workers.processes import ProcessCollectors
+from skillweave.workers.placement import make_collectors
 
 PID = 8  # the reward is the process
 
@@ -89,7 +89,7 @@ def collectors_of(env=Faulty, action=PID, late=1):
         engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
         return alone_in(engine, Plan(first, action, late))
 
-    found = ProcessCollectors(make, 2, 2, 1, "Faulty")
+    found = make_collectors(make, 4, 2, 1, "Faulty")
     found.start(Seeds(0))
     return found
 
