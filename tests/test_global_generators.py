@@ -187,7 +187,7 @@ def test_environments_of_skills_are_made_from_the_seed(everywhere):
     for number, seed in enumerate((1, 1, 2)):
         disturb(number)
         env = sw.make_options_env(everywhere, 2, 0.99, seed=seed)
-        made.append([one.unwrapped.weight for one in env.engine._envs.envs])
+        made.append([one.unwrapped.weight for one in env.engine.envs])
         env.close()
     assert made[0] == made[1] != made[2]
 

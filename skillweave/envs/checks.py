@@ -383,45 +383,39 @@ class Watch:
 
     def __init__(self, name: str, space: gym.Space[Any], num_envs: int, first: int = 0) -> None:
         self._name = name
-        self._num_envs = num_envs
         self._first = first
         self._places = tuple(_numbers_in(space))
         self._elapsed = np.zeros(num_envs, np.int64)
         self._coarse_noticed = first != 0  # only the first of several gives notices
         self._bounds = ImageBounds(name, space) if first == 0 else None
 
-    def check_reset(self, obs: Array, ids: Array | None = None) -> Array:
-        """Return the first observations of environments ``ids`` (None: all), unchanged.
+    def check_reset(self, obs: Array, ids: Array) -> None:
+        """Check the first observations of environments ``ids`` (n,).
 
         Raises:
             EnvError: an observation is not finite; the message names the environment.
         """
-        self._elapsed[slice(None) if ids is None else ids] = 0
+        self._elapsed[ids] = 0
         self._check(obs, ids)
-        return obs
 
-    def check_step(self, raw: Any, ids: Array | None = None) -> Any:
-        """Return the result (a ``RawStep``) of a step of environments ``ids``, unchanged.
+    def check_step(self, raw: Any, ids: Array) -> None:
+        """Check the result (a ``RawStep``) of a step of environments ``ids`` (n,).
 
         Raises:
             EnvError: an observation or a reward is not finite; the message names the
                 environment and the step.
         """
-        if ids is None:
-            self._elapsed += 1
-        else:
-            self._elapsed[ids] += 1
+        self._elapsed[ids] += 1
         self._check(raw.next_obs, ids)
         if (row := wrong_reward(raw.reward)) is not None:
             raise self._wrong(row, ids, f"its reward is {raw.reward[row]}; {_REWARDS}")
-        return raw
 
-    def too_long(self, ids: Array | None = None) -> Array:
+    def too_long(self, ids: Array) -> Array:
         """Return where episodes of environments ``ids`` reach ``LONGEST_EPISODE``, (n,) bool."""
-        reached: Array = self._elapsed[slice(None) if ids is None else ids] >= LONGEST_EPISODE
+        reached: Array = self._elapsed[ids] >= LONGEST_EPISODE
         return reached
 
-    def _check(self, obs: Array, ids: Array | None) -> None:
+    def _check(self, obs: Array, ids: Array) -> None:
         for place in self._places:
             part = obs
             for name in place:
@@ -441,7 +435,7 @@ class Watch:
         if self._bounds is not None and not self._bounds.see(obs):
             self._bounds = None
 
-    def _out_of_range(self, part: Array, place: tuple[str, ...], ids: Array | None) -> EnvError:
+    def _out_of_range(self, part: Array, place: tuple[str, ...], ids: Array) -> EnvError:
         bad = ~(np.abs(part) <= LARGEST_SEEN).reshape(len(part), -1)
         row = int(np.flatnonzero(bad.any(axis=1))[0])
         wrong = part[row].reshape(-1)[bad[row]]
@@ -466,8 +460,8 @@ class Watch:
             "use other units"
         )
 
-    def _wrong(self, row: int, ids: Array | None, what: str) -> EnvError:
-        number = row if ids is None else int(ids[row])
+    def _wrong(self, row: int, ids: Array, what: str) -> EnvError:
+        number = int(ids[row])
         step = int(self._elapsed[number])
         return EnvError(
             f"{self._name}: environment {number + self._first}, step {step} of its episode: {what}"

@@ -13,9 +13,8 @@ for environments whose dynamics follow from these two.
 from __future__ import annotations
 
 import copy
-import functools
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -115,42 +114,108 @@ class Engine(Protocol):
         ...
 
 
-class GymnasiumEngine:
+class WatchedEngine:
+    """What engines have in common: what comes back is checked, and what is done is kept.
+
+    Args:
+        env: one of the environments, for its spaces and its time limit.
+        name: the environments' name in messages.
+        first: the number of the first environment, for messages.
+        seen: the space of observations, if they may hold an action mask.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        num_envs: int,
+        name: str,
+        first: int = 0,
+        seen: gym.Space[Any] | None = None,
+    ) -> None:
+        self.num_envs = num_envs
+        self.steps_made = 0
+        self.observation_space: gym.Space[Any] = env.observation_space
+        self.action_space: gym.Space[Any] = copy.deepcopy(env.action_space)  # seeded by others
+        self.time_limit = time_limit(env)
+        self._name = name
+        self._all = np.arange(num_envs)
+        self._root = 0
+        self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
+        self._masks = ActionMasks(self.action_space, num_envs, seen)
+        self._watch = Watch(name, self.observation_space, num_envs, first)
+        action = np.zeros((num_envs, *obs_shape(self.action_space)), obs_dtype(self.action_space))
+        self._history = History(num_envs, action)
+
+    def step(self, action: Array, ids: Array | None = None) -> RawStep:
+        """Step some environments; the others do not change."""
+        ids = self._all if ids is None else ids
+        self._history.add(action, ids)
+        self.steps_made += len(ids)
+        return self._act(action, ids)
+
+    def mask(self) -> Array | None:
+        """Return the actions allowed in the latest observations, (N, A) bool; None: always all."""
+        return self._masks.now
+
+    def _act(self, action: Array, ids: Array) -> RawStep:
+        """Step environments ``ids`` (n,), also again, without an entry in the history."""
+        raise NotImplementedError
+
+    def _begun(self, obs: Array, info: dict[str, Any], ids: Array) -> Array:
+        """Return observations after a reset, which are checked."""
+        self._masks.see(info, ids, obs=obs)
+        self._watch.check_reset(obs, ids)
+        return obs
+
+    def _stepped(self, raw: RawStep, ids: Array) -> RawStep:
+        """Return the result of a step, which is checked, and truncated after too many steps."""
+        self._masks.see(raw.info, ids, raw.terminated | raw.truncated, raw.next_obs)
+        self._watch.check_step(raw, ids)
+        raw.truncated = (raw.truncated | self._watch.too_long(ids)) & ~raw.terminated
+        return raw
+
+
+class GymnasiumEngine(WatchedEngine):
     """Gymnasium environments, stepped one after another in this process.
 
     Every episode has its own seed, so that it can be repeated.
 
     Args:
-        first: the number of the first environment, for messages.
+        make: makes the environment of a ``number``.
+        name: their name in messages.
+        first: the number of the first environment.
         check_seed: check before training that the first environment repeats itself.
+
+    Raises:
+        EnvError: the environments have different spaces, or two are the same object.
     """
 
     def __init__(
         self, make: Any, num_envs: int, name: str, first: int = 0, check_seed: bool = False
     ) -> None:
-        makers = [functools.partial(make, number=first + i) for i in range(num_envs)]
-        self._envs = SyncEnvs(makers, name)
-        self.num_envs = num_envs
-        self.steps_made = 0
-        self.observation_space: gym.Space[Any] = self._envs.observation_space
-        self.action_space: gym.Space[Any] = self._envs.action_space
-        self.time_limit = time_limit(self._envs.envs[0])
-        self._masks = ActionMasks(
-            self.action_space, num_envs, observation_space=self.observation_space
-        )
-        self._watch = Watch(name, self.observation_space, num_envs, first)
-        self._name = name
+        self.envs: list[gym.Env[Any, Any]] = []
+        try:
+            for number in range(first, first + num_envs):
+                self.envs.append(self._made(make, number))
+            self._check_alike(name)
+        except BaseException:
+            self.close()
+            raise
+        env = self.envs[0]
+        super().__init__(env, num_envs, name, first, env.observation_space)
         self._check_seed = check_seed and first == 0
         self.trains = False
         """Learners learn from these environments."""
         self._draws = GlobalDraws(LOOKS if are_collected() else 0)
+        self._dtype, self._shape = (
+            obs_dtype(env.observation_space),
+            obs_shape(env.observation_space),
+        )
         self._action_dtype = obs_dtype(self.action_space)
-        shape = num_envs, *obs_shape(self.action_space)
-        self._all = np.arange(num_envs)
-        self._root = 0
+        self._joint = parts(self.action_space) is not None
+        self._over = np.zeros(num_envs, bool)  # True where the episode has ended
         self._episode = np.zeros(num_envs, np.int64)  # episodes started since the root seed
         self._seed = np.zeros(num_envs, np.int64)  # of the open episode
-        self._history = History(num_envs, np.zeros(shape, self._action_dtype))
 
     def reset(self, seed: int) -> Array:
         """Reset all environments from one seed; return observations (N, *obs_shape)."""
@@ -168,13 +233,6 @@ class GymnasiumEngine:
         self._seed[ids] = seeds
         self._history.forget(ids)
         return self._begin(ids)
-
-    def step(self, action: Array, ids: Array | None = None) -> RawStep:
-        """Step some environments; the others do not change."""
-        rows = self._all if ids is None else ids
-        self._history.add(action, rows)
-        self.steps_made += len(rows)
-        return self._act(action, ids)
 
     def state(self) -> dict[str, Array]:
         """Return the seeds and the actions since."""
@@ -207,23 +265,54 @@ class GymnasiumEngine:
                     early.append(ended)
         return obs, np.unique(np.concatenate(early))
 
-    def mask(self) -> Array | None:
-        """Return the actions allowed in the latest observations, (N, A) bool; None: always all."""
-        return self._masks.now
-
     def close(self) -> None:
-        """Release the environments."""
-        self._envs.close()
+        """Close all environments."""
+        for env in self.envs:
+            env.close()
 
     def _begin(self, ids: Array) -> Array:
-        """Reset environments ``ids`` to their seeds."""
+        """Reset environments ``ids`` (n,) to their seeds."""
         if self._draws.looks:
             self._draws.begin()
-        obs, info = self._envs.begin(ids, self._seed[ids])
+        obs, infos = self._empty(len(ids)), []
+        for row, (i, seed) in enumerate(zip(ids.tolist(), self._seed[ids].tolist(), strict=True)):
+            observation, info = self.envs[i].reset(seed=seed)
+            put_observation(self.observation_space, obs, row, observation)
+            infos.append(info)
+        self._over[ids] = False
         if self._draws.looks:
             self._notice_draws()
-        self._masks.see(info, ids, obs=obs)
-        return self._watch.check_reset(obs, ids)
+        return self._begun(obs, batched_infos(infos), ids)
+
+    def _act(self, action: Array, ids: Array) -> RawStep:
+        assert not self._over[ids].any(), "an episode that is over must be reset first"
+        n = len(ids)
+        obs, infos, reward = self._empty(n), [], np.zeros(n)
+        terminated, truncated = np.zeros(n, bool), np.zeros(n, bool)
+        # A copy: environments receive views of it, and may keep them.
+        acted = np.array(action, self._action_dtype)
+        each: Iterable[Any]
+        if self._joint:
+            each = (env_form(self.action_space, one) for one in acted)
+        else:
+            # A row without axes is a NumPy scalar, which a Box does not contain.
+            each = acted.tolist() if self._discrete else map(np.asarray, acted)
+        if self._draws.looks:
+            self._draws.begin()
+        for row, (i, one) in enumerate(zip(ids.tolist(), each, strict=True)):
+            result = self.envs[i].step(one)
+            observation, reward[row], terminated[row], truncated[row], info = result
+            # At once: several environments may share one buffer of observations.
+            if self._dtype.names is not None:
+                put_observation(self.observation_space, obs, row, observation)
+            else:
+                obs[row] = observation
+            infos.append(info)
+        self._over[ids] = terminated | truncated
+        if self._draws.looks:
+            self._notice_draws()
+        paid = reward.astype(np.float32)
+        return self._stepped(RawStep(obs, paid, terminated, truncated, batched_infos(infos)), ids)
 
     def _check_repeats(self) -> None:
         """Give a notice if a seed and an action have two outcomes in environment 0."""
@@ -260,115 +349,18 @@ class GymnasiumEngine:
                 "instead, which super().reset(seed=seed) seeds"
             )
 
-    def _act(self, action: Array, ids: Array | None) -> RawStep:
-        rows = self._all if ids is None else ids
-        # A copy: environments receive views of it, and may keep them.
-        acted = np.array(action, self._action_dtype)
-        if self._draws.looks:
-            self._draws.begin()
-        next_obs, reward, terminated, truncated, info = self._envs.act(acted, rows)
-        if self._draws.looks:
-            self._notice_draws()
-        self._masks.see(info, ids, terminated | truncated, next_obs)
-        raw = RawStep(next_obs, reward.astype(np.float32), terminated, truncated, info)
-        self._watch.check_step(raw, ids)
-        raw.truncated = (truncated | self._watch.too_long(ids)) & ~terminated
-        return raw
-
-
-class SyncEnvs:
-    """N environments in this process, of which some can be reset or stepped.
-
-    Args:
-        makers: each makes one of the N environments.
-        name: their name in messages.
-
-    Raises:
-        EnvError: the environments have different spaces, or two are the same object.
-    """
-
-    def __init__(self, makers: Sequence[Callable[[], gym.Env[Any, Any]]], name: str) -> None:
-        self.envs: list[gym.Env[Any, Any]] = []
+    def _made(self, make: Any, number: int) -> gym.Env[Any, Any]:
         try:
-            for make in makers:
-                self.envs.append(self._make(make))
-            self._check_alike(name)
-        except BaseException:
-            self.close()
-            raise
-        self.observation_space = self.envs[0].observation_space
-        self.action_space = copy.deepcopy(self.envs[0].action_space)  # seeded by others
-        self._dtype = obs_dtype(self.observation_space)
-        self._shape = obs_shape(self.observation_space)
-        self._parts = self._dtype.names is not None
-        self._over = np.zeros(len(self.envs), bool)  # True where the episode has ended
-        self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
-        self._joint = parts(self.action_space) is not None
-
-    def begin(self, ids: Array, seeds: Array) -> tuple[Array, dict[str, Any]]:
-        """Reset environments ``ids`` (n,) to ``seeds`` (n,).
-
-        Returns:
-            Observations (n, *obs_shape), and their batched infos.
-        """
-        obs = self._empty(len(ids))
-        infos: list[dict[str, Any]] = []
-        for row, (i, seed) in enumerate(zip(ids.tolist(), seeds, strict=True)):
-            observation, info = self.envs[i].reset(seed=int(seed))
-            put_observation(self.observation_space, obs, row, observation)
-            infos.append(info)
-        self._over[ids] = False
-        return obs, batched_infos(infos)
-
-    def act(self, action: Array, ids: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Step environments ``ids`` (n,) with ``action`` (n, ...).
-
-        The environments may keep their actions, so the array must not change afterwards.
-
-        Returns:
-            Observations, rewards, terminated, truncated, each with n rows, and batched infos.
-        """
-        assert not self._over[ids].any(), "an episode that is over must be reset first"
-        n = len(ids)
-        obs = self._empty(n)
-        infos: list[dict[str, Any]] = []
-        reward = np.zeros(n)
-        terminated = np.zeros(n, bool)
-        truncated = np.zeros(n, bool)
-        each: Iterable[Any]
-        if self._joint:
-            each = (env_form(self.action_space, one) for one in action)
-        else:
-            # A row without axes is a NumPy scalar, which a Box does not contain.
-            each = action.tolist() if self._discrete else map(np.asarray, action)
-        for row, (i, one) in enumerate(zip(ids.tolist(), each, strict=True)):
-            result = self.envs[i].step(one)
-            observation, reward[row], terminated[row], truncated[row], info = result
-            # At once: several environments may share one buffer of observations.
-            if self._parts:
-                put_observation(self.observation_space, obs, row, observation)
-            else:
-                obs[row] = observation
-            infos.append(info)
-        self._over[ids] = terminated | truncated
-        return obs, reward, terminated, truncated, batched_infos(infos)
-
-    def close(self) -> None:
-        """Close all environments."""
-        for env in self.envs:
-            env.close()
-
-    def _make(self, make: Callable[[], gym.Env[Any, Any]]) -> gym.Env[Any, Any]:
-        try:
-            return make()
+            made: gym.Env[Any, Any] = make(number=number)
         except SkillweaveError as error:
-            if not (number := len(self.envs)):
+            if not (count := len(self.envs)):
                 raise
             raise reworded(
                 error,
-                f"{error}. {number} could be made: if no more can exist at once, set "
-                f"num_envs={number} in each algorithm, the selector's too",
+                f"{error}. {count} could be made: if no more can exist at once, set "
+                f"num_envs={count} in each algorithm, the selector's too",
             ) from error
+        return made
 
     def _empty(self, n: int) -> Array:
         # Zeros, because the bytes between the parts of an observation are written to files.

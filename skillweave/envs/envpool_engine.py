@@ -8,10 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.envs.checks import Watch, time_limit
-from skillweave.envs.engine import RawStep
-from skillweave.envs.history import History
-from skillweave.envs.infos import ActionMasks
+from skillweave.envs.engine import RawStep, WatchedEngine
 from skillweave.envs.pool import MakePool, installed, no_precision_warnings
 from skillweave.errors import EnvError, MissingExtra
 from skillweave.spaces import pack
@@ -21,7 +18,7 @@ RENEW_AFTER = 100_000
 """Steps since the seed of a pool after which environments move to a new pool."""
 
 
-class EnvPoolEngine:
+class EnvPoolEngine(WatchedEngine):
     """Environments of a pool: EnvPool's, or one that a user wraps.
 
     A pool is seeded when it is created, so an environment can be repeated only from there. To keep
@@ -38,25 +35,14 @@ class EnvPoolEngine:
     def __init__(
         self, make: MakePool, name: str, num_envs: int, threads: int, spaces: gym.Env[Any, Any]
     ) -> None:
+        # EnvPool may state looser bounds; Gymnasium's are the reference (see `supports`).
+        super().__init__(spaces, num_envs, name)
         self._make = make
         self._threads = min(threads, num_envs)
-        self.num_envs = num_envs
-        self.steps_made = 0
-        # EnvPool may state looser bounds; Gymnasium's are the reference (see `supports`).
-        self.observation_space = spaces.observation_space
-        self.action_space = spaces.action_space
-        self.time_limit = time_limit(spaces)
-        self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
-        self._all = np.arange(num_envs)
-        self._root = 0
         self._made = 0  # pools since the root seed
         self._pools: list[Any] = []
         self._seeds: list[int] = []  # of the pools
         self._place = np.zeros(num_envs, np.int64)  # the pool of each environment
-        example: Any = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
-        self._history = History(num_envs, example)
-        self._masks = ActionMasks(self.action_space, num_envs)
-        self._watch = Watch(name, self.observation_space, num_envs)
 
     @staticmethod
     def supports(env_id: str, reference: gym.Env[Any, Any]) -> bool:
@@ -118,13 +104,6 @@ class EnvPoolEngine:
             self._place[:] = 0
         return self._begin(ids)
 
-    def step(self, action: Array, ids: Array | None = None) -> RawStep:
-        """Step some environments; the others do not change."""
-        rows = self._all if ids is None else ids
-        self._history.add(action, rows)
-        self.steps_made += len(rows)
-        return self._act(action, rows)
-
     def _add_pool(self) -> None:
         """Create the next pool, with its own seed."""
         node = np.random.SeedSequence(self._root, spawn_key=(self._made,))
@@ -166,10 +145,6 @@ class EnvPoolEngine:
                 over[ids] = raw.terminated | raw.truncated
         return obs, np.flatnonzero(early | over)
 
-    def mask(self) -> Array | None:
-        """Return the actions allowed in the latest observations, (N, A) bool; None: always all."""
-        return self._masks.now
-
     def close(self) -> None:
         """Release the environments."""
         self._pools = []
@@ -180,8 +155,7 @@ class EnvPoolEngine:
             return pack(self.observation_space, obs), info
 
         obs, info = self._in_pools(ids, reset)
-        self._masks.see(info, ids)
-        return self._watch.check_reset(obs, ids)
+        return self._begun(obs, info, ids)
 
     def _act(self, action: Array, ids: Array) -> RawStep:
         if self._discrete:
@@ -193,11 +167,7 @@ class EnvPoolEngine:
 
         # An episode that terminates in the step of its time limit arrives as truncated: EnvPool
         # computes `terminated = done & ~truncated`, so the two cannot be distinguished.
-        raw = RawStep(*self._in_pools(ids, step))
-        self._masks.see(raw.info, ids, raw.terminated | raw.truncated)
-        self._watch.check_step(raw, ids)
-        raw.truncated = (raw.truncated | self._watch.too_long(ids)) & ~raw.terminated
-        return raw
+        return self._stepped(RawStep(*self._in_pools(ids, step)), ids)
 
     def _in_pools(
         self, ids: Array, call: Callable[[Any, Array], tuple[Any, ...]]

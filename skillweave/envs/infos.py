@@ -87,14 +87,13 @@ class ActionMasks:
         self,
         space: gym.Space[Any],
         num_envs: int,
-        now: Array | None = None,
         observation_space: gym.Space[Any] | None = None,
     ) -> None:
         self._space = space
         self._num_envs = num_envs
         self._observed = observation_space is not None and observes_mask(observation_space, space)
         self._choices = choice_counts(space)
-        self.now = now
+        self.now: Array | None = None
         """(N, A) bool; None: no environment has returned a mask so far. Never changed in place."""
 
     def see(

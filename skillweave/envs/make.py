@@ -356,7 +356,7 @@ def _step_seconds(env: gym.Env[Any, Any]) -> float:
     """Measure the seconds of a random step: the least of several means, to exclude load."""
     space = env.observation_space
     rng = np.random.default_rng(0)
-    masks = ActionMasks(env.action_space, 1, observation_space=space)
+    masks = ActionMasks(env.action_space, 1, space)
     means = []
 
     def see(obs: Any, info: dict[str, Any], ended: bool = False) -> None:

@@ -185,7 +185,7 @@ def raw(obs, reward=(0.0, 0.0)):
 def test_the_watch_counts_the_steps_of_each_environment():
     watch = Watch("X", BOX, 3)
     fine, bad = np.zeros((2, 2), np.float32), np.float32([[0, 0], [np.nan, 0]])
-    watch.check_reset(np.zeros((3, 2), np.float32))
+    watch.check_reset(np.zeros((3, 2), np.float32), np.arange(3))
     for _ in range(4):
         watch.check_step(raw(fine), np.array([0, 2]))
     watch.check_reset(fine[:1], np.array([0]))
@@ -206,16 +206,16 @@ def test_the_watch_sees_the_numbers_in_the_parts_of_an_observation():
 def test_large_numbers_are_numbers():
     watch = Watch("X", BOX, 2)
     huge = np.full((2, 2), 3e38, np.float32)  # their squares are infinite
-    assert watch.check_reset(huge) is huge
-    watch.check_step(raw(huge, (1e15, -1e15)))
+    watch.check_reset(huge, np.arange(2))
+    watch.check_step(raw(huge, (1e15, -1e15)), np.arange(2))
 
 
 def test_a_reward_too_large_to_be_squared_names_its_environment():
     # Before, training ended with a NaN and the advice to lower the learning rate.
     watch = Watch("X", BOX, 2)
-    watch.check_reset(zeros := np.zeros((2, 2), np.float32))
+    watch.check_reset(zeros := np.zeros((2, 2), np.float32), np.arange(2))
     with pytest.raises(EnvError, match=r"X: environment 1, step 1.*at most 1e\+15 in size"):
-        watch.check_step(raw(zeros, (0.0, 2e15)))
+        watch.check_step(raw(zeros, (0.0, 2e15)), np.arange(2))
 
 
 def test_envpool_is_watched_too(monkeypatch):

@@ -215,7 +215,7 @@ def test_what_skills_draw_follows_from_the_requests_seeds(kind):
         collector = collector_of(skills)
         for request in itertools.islice(requests(20), first, first + 3):
             collector.collect(request)
-        return [e.unwrapped.log for e in collector.engine._envs.envs]
+        return [e.unwrapped.log for e in collector.engine.envs]
 
     sampled = play(0, greedy=False)
     assert sampled == play(0, greedy=False)
@@ -230,5 +230,5 @@ def test_skills_go_on_sampling_anew_from_call_to_call():
     collector = collector_of(skill_set(Die, call_steps=3, greedy=False), 1)
     for request in itertools.islice(requests(30), 4):
         collector.collect(request)
-    acted = [a for _, _, a in collector.engine._envs.envs[0].unwrapped.log]
+    acted = [a for _, _, a in collector.engine.envs[0].unwrapped.log]
     assert len({tuple(acted[i : i + 3]) for i in range(0, 90, 3)}) > 10

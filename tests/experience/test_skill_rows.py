@@ -128,7 +128,7 @@ def test_memory_is_empty_where_an_episode_begins_and_starts_say_so(collector, sk
     env = collector(env=Walk, skill=skill, num_envs=4, acting=lambda n: Counts(n, 3))
     scalars = [ScalarSkill(Walk(), skill, s) for s in seeds_of(SEED, 4)]
     begun, remembered = 0, np.zeros(4)
-    walks = [e.unwrapped for e in env.engine._envs.envs]
+    walks = [e.unwrapped for e in env.engine.envs]
     for request in itertools.islice(requests(rows), 140 // rows):
         experience = env.collect(request).batches[""]
         first = [True] * 4

@@ -35,7 +35,7 @@ from skillweave import (
     train_agent,
 )
 from skillweave.cli import main
-from skillweave.envs.engine import SyncEnvs
+from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.infos import info_numbers
 from skillweave.errors import EnvError
 from skillweave.evolution import Evolution
@@ -304,9 +304,8 @@ class Mixed(gym.Env[Any, Any]):
     action_space = gym.spaces.Discrete(2)
     made = 0
 
-    def __init__(self) -> None:
-        self.value = (False, 2, 0.5, None)[Mixed.made % 4]
-        Mixed.made += 1
+    def __init__(self, number: int) -> None:
+        self.value = (False, 2, 0.5, None)[(number + Mixed.made) % 4]
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         return np.zeros(1, np.float32), {}
@@ -316,12 +315,10 @@ class Mixed(gym.Env[Any, Any]):
 
 
 def test_numbers_of_several_types_keep_their_values() -> None:
-    envs = SyncEnvs([Mixed] * 3, "mixed")
-    *_, info = envs.act(np.zeros(3, np.int64), np.arange(3))
+    info = GymnasiumEngine(Mixed, 3, "mixed").step(np.zeros(3, np.int64)).info
     np.testing.assert_array_equal(info["x"], [0.0, 2.0, 0.5])
     Mixed.made = 1
-    envs = SyncEnvs([Mixed] * 3, "mixed")
-    *_, info = envs.act(np.zeros(3, np.int64), np.arange(3))
+    info = GymnasiumEngine(Mixed, 3, "mixed").step(np.zeros(3, np.int64)).info
     assert info["x"].tolist() == [2, 0.5, None]
     np.testing.assert_array_equal(info_numbers(info, "x", np.arange(3), 3), [2, 0.5, np.nan])
 
