@@ -22,9 +22,9 @@ from skillweave.envs.image_bounds import ImageBounds
 from skillweave.envs.infos import MASK, observes_mask
 from skillweave.envs.pool import first_row
 from skillweave.errors import EnvError, SkillweaveError
-from skillweave.policies.spaces import space_of
+from skillweave.policies.spaces import at, space_of
 from skillweave.spaces import choice_counts, obs_shape
-from skillweave.spaces.packing import parts
+from skillweave.spaces.packing import leaf_spaces
 from skillweave.types import LARGEST_REWARD, Array, wrong_reward
 
 LONGEST_EPISODE = 100_000
@@ -384,7 +384,13 @@ class Watch:
     def __init__(self, name: str, space: gym.Space[Any], num_envs: int, first: int = 0) -> None:
         self._name = name
         self._first = first
-        self._places = tuple(_numbers_in(space))
+        # Floats, and whole numbers that float32 may not represent.
+        self._places = [
+            place
+            for place, leaf in leaf_spaces(space).items()
+            if isinstance(leaf, gym.spaces.Box)
+            and (leaf.dtype.kind == "f" or (leaf.dtype.kind in "iu" and leaf.dtype.itemsize >= 4))
+        ]
         self._elapsed = np.zeros(num_envs, np.int64)
         self._coarse_noticed = first != 0  # only the first of several gives notices
         self._bounds = ImageBounds(name, space) if first == 0 else None
@@ -417,9 +423,7 @@ class Watch:
 
     def _check(self, obs: Array, ids: Array) -> None:
         for place in self._places:
-            part = obs
-            for name in place:
-                part = part[name]
+            part = at(obs, place)
             coarse = part.dtype.itemsize > 4
             real = part.dtype.kind == "f"
             if not real and self._coarse_noticed:
@@ -470,18 +474,6 @@ class Watch:
 
 def _named(place: tuple[str, ...]) -> str:
     return f" ({'.'.join(place)})" if place else ""
-
-
-def _numbers_in(space: gym.Space[Any], place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Yield the part names of floats, and of whole numbers that float32 may not represent."""
-    inner = parts(space)
-    if inner is not None:
-        for name, part in inner.items():
-            yield from _numbers_in(part, (*place, name))
-    elif isinstance(space, gym.spaces.Box):
-        dtype = np.dtype(space.dtype)
-        if dtype.kind == "f" or (dtype.kind in "iu" and dtype.itemsize >= 4):
-            yield place
 
 
 def _fits(space: gym.Space[Any]) -> Callable[[Any], bool]:

@@ -28,8 +28,8 @@ from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks, allowed_rows, random_actions
 from skillweave.errors import EnvError, SkillweaveError, reworded
 from skillweave.policies.infos import batched_infos
-from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
-from skillweave.spaces.packing import parts
+from skillweave.policies.spaces import space_of
+from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, Step
 
 LOOKS = 12
@@ -212,7 +212,8 @@ class GymnasiumEngine(WatchedEngine):
             obs_shape(env.observation_space),
         )
         self._action_dtype = obs_dtype(self.action_space)
-        self._joint = parts(self.action_space) is not None
+        whole = space_of(self.action_space)
+        self._parts = None if whole.parts is None else whole
         self._over = np.zeros(num_envs, bool)  # True where the episode has ended
         self._episode = np.zeros(num_envs, np.int64)  # episodes started since the root seed
         self._seed = np.zeros(num_envs, np.int64)  # of the open episode
@@ -292,8 +293,8 @@ class GymnasiumEngine(WatchedEngine):
         # A copy: environments receive views of it, and may keep them.
         acted = np.array(action, self._action_dtype)
         each: Iterable[Any]
-        if self._joint:
-            each = (env_form(self.action_space, one) for one in acted)
+        if self._parts is not None:
+            each = map(self._parts.unpacked, acted)
         else:
             # A row without axes is a NumPy scalar, which a Box does not contain.
             each = acted.tolist() if self._discrete else map(np.asarray, acted)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,8 +10,9 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.notices import notice
+from skillweave.policies.spaces import at
 from skillweave.spaces.observations import image_layout
-from skillweave.spaces.packing import parts
+from skillweave.spaces.packing import leaf_spaces
 from skillweave.types import Array
 
 LOOKS = 64
@@ -38,9 +38,7 @@ class _Image:
 
     def see(self, obs: Array) -> None:
         """Update the ranges with observations (n, *obs_shape)."""
-        for name in self.place:
-            obs = obs[name]
-        values = obs[:ROWS].astype(np.float64)
+        values = at(obs, self.place)[:ROWS].astype(np.float64)
         span = np.where(self.high > self.low, self.high - self.low, 1.0)
         for limits, array in ((self.seen, values), (self.scaled, (values - self.low) / span)):
             limits[:] = min(limits[0], float(array.min())), max(limits[1], float(array.max()))
@@ -61,7 +59,11 @@ class ImageBounds:
 
     def __init__(self, name: str, space: gym.Space[Any]) -> None:
         self._name = name
-        self._images = list(_images_in(space))
+        self._images = [
+            _Image(place, leaf.low.astype(np.float64), leaf.high.astype(np.float64))
+            for place, leaf in leaf_spaces(space).items()
+            if image_layout(leaf) is not None
+        ]
         self._looks = LOOKS
 
     def see(self, obs: Array) -> bool:
@@ -105,12 +107,3 @@ class ImageBounds:
 def _unit(value: float) -> float:
     """Return the unit of a number's first digit: 100 for 255."""
     return float(10.0 ** math.floor(math.log10(abs(value) or 1.0)))
-
-
-def _images_in(space: gym.Space[Any], place: tuple[str, ...] = ()) -> Iterator[_Image]:
-    inner = parts(space)
-    if inner is not None:
-        for name, part in inner.items():
-            yield from _images_in(part, (*place, name))
-    elif isinstance(space, gym.spaces.Box) and image_layout(space) is not None:
-        yield _Image(place, space.low.astype(np.float64), space.high.astype(np.float64))

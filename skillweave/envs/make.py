@@ -25,8 +25,9 @@ from skillweave.envs.obs_names import Names, ObsNames, names_in
 from skillweave.envs.pool import MakePool, envpool, takes_ids
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError
 from skillweave.policies.infos import batched_infos
+from skillweave.policies.spaces import space_of
 from skillweave.schema import AtLeastOne, Check, check_fields, to_json
-from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
+from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.spaces.packing import parts
 
 MOST = 65_536
@@ -357,7 +358,7 @@ def _step_seconds(env: gym.Env[Any, Any]) -> float:
     space = env.observation_space
     rng = np.random.default_rng(0)
     masks = ActionMasks(env.action_space, 1, space)
-    means = []
+    means, form = [], space_of(env.action_space)
 
     def see(obs: Any, info: dict[str, Any], ended: bool = False) -> None:
         batch = np.zeros((1, *obs_shape(space)), obs_dtype(space))
@@ -371,7 +372,7 @@ def _step_seconds(env: gym.Env[Any, Any]) -> float:
         until = time.perf_counter() + PIECE_SECONDS
         while steps == 0 or (steps < PIECE_STEPS and time.perf_counter() < until):
             drawn = random_actions(env.action_space, 1, rng, masks.now)
-            action = env_form(env.action_space, drawn[0])
+            action = form.unpacked(drawn[0])
             began = time.perf_counter()
             obs, _, terminated, truncated, info = env.step(action)
             spent += time.perf_counter() - began

@@ -241,12 +241,9 @@ def _parts_of(obs: ObsCodec) -> list[_Part]:
     observed: list[_Part] = []
     start = 0
     images = 0
-    for leaf, space in zip(obs.leaves, _leaf_spaces(obs.space), strict=True):
+    for leaf in obs.leaves:
         if leaf.image is not None:
-            low, high = (
-                obs.pixels(leaf.image.read(torch.from_numpy(x), torch.Size()), images)
-                for x in (np.asarray(x, np.float64) for x in (space.low, space.high))
-            )
+            low, high = (obs.pixels(x, images) for x in leaf.ends)
             box = gym.spaces.Box(low.numpy(), high.numpy(), dtype=np.float32)
             observed.append(_Part(f"image.{images}", box))
             images += 1
@@ -257,15 +254,6 @@ def _parts_of(obs: ObsCodec) -> list[_Part]:
         observed.append(_Part("vector", box, start, leaf.choices))
         start += leaf.size
     return observed
-
-
-def _leaf_spaces(space: gym.Space[Any]) -> Iterator[Any]:
-    inner = parts(space)
-    if inner is None:
-        yield space
-        return
-    for part in inner.values():
-        yield from _leaf_spaces(part)
 
 
 def _seen_space(space: gym.Space[Any], leaves: Iterator[gym.Space[Any]]) -> gym.Space[Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -17,7 +16,7 @@ from torch import Tensor
 from skillweave._internal.messages import short
 from skillweave.errors import EnvError
 from skillweave.policies.spaces import MOST_CHOICES, MOST_OF_ALL
-from skillweave.spaces.packing import check_size, obs_dtype, parts
+from skillweave.spaces.packing import check_size, leaf_spaces, obs_dtype, parts
 from skillweave.types import Array
 
 
@@ -313,7 +312,7 @@ def unsupported_action(space: gym.Space[Any], place: str = "") -> EnvError:
     """
     what, function = "Let a function make its actions", "gymnasium.spaces.Box(...)"
     supported = ACTIONS
-    if all(isinstance(leaf, gym.spaces.Box) for leaf in _leaves(space)):
+    if all(isinstance(leaf, gym.spaces.Box) for leaf in leaf_spaces(space).values()):
         supported += (
             f"; whole numbers of a Box need bounds and at most {MOST_CHOICES} values each, "
             f"{MOST_OF_ALL:,} in all"
@@ -327,14 +326,6 @@ def unsupported_action(space: gym.Space[Any], place: str = "") -> EnvError:
         "EnvSpec(env, wrappers=(lambda env: gymnasium.wrappers.TransformAction(env, function, "
         f"{function}),))"
     )
-
-
-def _leaves(space: gym.Space[Any]) -> Iterator[gym.Space[Any]]:
-    if not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
-        yield space
-        return
-    for part in (parts(space) or {}).values():
-        yield from _leaves(part)
 
 
 def values_of(space: gym.spaces.Box) -> np.ndarray[Any, Any] | None:

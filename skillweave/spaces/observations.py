@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -13,7 +13,13 @@ import torch
 from torch import Tensor
 
 from skillweave.errors import EnvError
-from skillweave.spaces.packing import LARGEST, check_size, obs_dtype, obs_shape, parts
+from skillweave.spaces.packing import (
+    LARGEST,
+    check_size,
+    leaf_spaces,
+    obs_dtype,
+    obs_shape,
+)
 from skillweave.types import Array
 
 _SMALLEST = 16  # sides of a plain matrix of bytes that is an image
@@ -124,6 +130,15 @@ class _Leaf:
     bounds: tuple[Array, Array] | None = field(default=None, compare=False)  # of an image
     name: str = ""  # of the part: ``board``, ``pair.0``; "": it is the whole observation
 
+    @property
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """Return the lowest and the highest number of each pixel, (C, H, W) float64."""
+        assert self.image is not None
+        assert self.bounds is not None
+        ends = (torch.from_numpy(np.asarray(x, np.float64)) for x in self.bounds)
+        low, high = (self.image.read(x, torch.Size()) for x in ends)
+        return low, high
+
     def laid_out(self, planes: Literal["first", "last"]) -> _Leaf:
         """Return the leaf, an image, with its channels in the axis that ``planes`` names."""
         assert self.image is not None
@@ -231,12 +246,11 @@ class PixelScale:
     """A scale of pixels to [0, 1] by the bounds of their space, which may differ between pixels.
 
     Args:
-        low: the lowest number of each pixel, (C, H, W).
+        low: the lowest number of each pixel, (C, H, W) float64.
         high: the highest one.
     """
 
     def __init__(self, low: Array, high: Array) -> None:
-        low, high = low.astype(np.float64), high.astype(np.float64)
         span = np.where(high > low, high - low, 1.0)
         self._same = bool((low == low.flat[0]).all() and (span == span.flat[0]).all())
         self._low = float(low.flat[0])
@@ -276,7 +290,7 @@ def obs_codec(space: gym.Space[Any], planes: Literal["first", "last"] | None = N
         EnvError: the space is not supported; the message names supported ones.
     """
     dtype = obs_dtype(space)
-    leaves = tuple(_leaves(space, dtype, None))
+    leaves = tuple(_leaf(part, path, dtype) for path, part in leaf_spaces(space).items())
     unclear = [leaf for leaf in leaves if leaf.image is not None and not leaf.image.sure]
     if planes is not None:
         again = unclear or [leaf for leaf in leaves if leaf.image is not None]
@@ -297,7 +311,9 @@ def obs_codec(space: gym.Space[Any], planes: Literal["first", "last"] | None = N
         scaled=any(leaf.real for leaf in vectors),
         item=item,
         leaves=leaves,
-        scales=tuple(_scale(leaf) for leaf in leaves if leaf.image is not None),
+        scales=tuple(
+            PixelScale(*(x.numpy() for x in leaf.ends)) for leaf in leaves if leaf.image is not None
+        ),
         unclear=tuple(_described(leaf) for leaf in unclear),
         is_one_vector=item == (_floats_without_gap(leaves),),
     )
@@ -314,15 +330,6 @@ def _floats_without_gap(leaves: Iterable[_Leaf]) -> int | None:
     return end
 
 
-def _scale(leaf: _Leaf) -> PixelScale:
-    """Return the scale of a leaf that is an image."""
-    assert leaf.image is not None
-    assert leaf.bounds is not None
-    values = (np.asarray(x, np.float64) for x in leaf.bounds)
-    low, high = (leaf.image.read(torch.from_numpy(x), torch.Size()).numpy() for x in values)
-    return PixelScale(low, high)
-
-
 def _described(leaf: _Leaf) -> str:
     """Return a leaf's name for messages: ``the observation's part board of shape (3, 3, 3)``."""
     what = f"the observation's part {leaf.name}" if leaf.name else "the observation"
@@ -332,22 +339,18 @@ def _described(leaf: _Leaf) -> str:
     return f"{whole}, by its first axis a stack of {leaf.shape[0]} frames {leaf.shape[1:]},"
 
 
-def _leaves(
-    space: gym.Space[Any], dtype: np.dtype[Any], offset: int | None, names: tuple[str, ...] = ()
-) -> Iterator[_Leaf]:
-    """Yield the leaves of a space whose observations start ``offset`` bytes into the whole."""
-    if dtype.fields is not None:
-        for name, part in (parts(space) or {}).items():
-            field, at = dtype.fields[name][:2]
-            yield from _leaves(part, field.base, (offset or 0) + at, (*names, name))
-        return
-    shape = obs_shape(space)
-    place = None
-    if offset is not None:
+def _leaf(space: Any, names: tuple[str, ...], dtype: np.dtype[Any]) -> _Leaf:
+    """Return the leaf to which these names lead in observations of type ``dtype``."""
+    offset, shape, place = 0, obs_shape(space), None
+    for name in names:
+        assert dtype.fields is not None
+        field, start_of = dtype.fields[name][:2]
+        dtype, offset = field.base, offset + start_of
+    if names:
         place = slice(offset, offset + int(np.prod(shape)) * dtype.itemsize)
     choices, start = _choices(space)
     image = image_layout(space)
-    yield _Leaf(
+    return _Leaf(
         shape,
         place,
         torch.from_numpy(np.empty(0, dtype)).dtype,
@@ -355,7 +358,7 @@ def _leaves(
         choices,
         start,
         image,
-        None if image is None else (space.low, space.high),  # type: ignore[attr-defined]
+        None if image is None else (space.low, space.high),
         ".".join(names),
     )
 

@@ -6,7 +6,6 @@ Dict and Tuple become structured arrays, so that ``obs[rows]``, ``obs[rows] = x`
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +13,7 @@ import numpy as np
 
 from skillweave._internal.messages import short
 from skillweave.errors import EnvError
+from skillweave.policies.spaces import at
 from skillweave.types import Array
 
 OBSERVATIONS = "Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of these"
@@ -53,6 +53,18 @@ def parts(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
     if not named or not all(isinstance(name, str) and name for name in named):
         raise EnvError(f"space {space} needs at least one part, each with text as its name")
     return named
+
+
+def leaf_spaces(space: gym.Space[Any]) -> dict[tuple[str, ...], Any]:
+    """Return the innermost parts of a space, in order, by the names that lead to them."""
+    inner = parts(space)
+    if inner is None:
+        return {(): space}
+    return {
+        (name, *path): leaf
+        for name, part in inner.items()
+        for path, leaf in leaf_spaces(part).items()
+    }
 
 
 def obs_shape(space: gym.Space[Any]) -> tuple[int, ...]:
@@ -137,9 +149,17 @@ def pack(space: gym.Space[Any], batched: Any) -> Array:
     """
     if isinstance(batched, np.ndarray) or parts(space) is None:
         return np.asarray(batched)
+    values = {}
+    for path, leaf in leaf_spaces(space).items():
+        value = batched
+        for name in path:
+            value = value[int(name)] if isinstance(value, tuple | list) else value[name]
+        values[path] = value
+        lead = np.shape(value)[: np.ndim(value) - len(obs_shape(leaf))]
     # Zeros, because the bytes between parts are written to files, which must be reproducible.
-    packed = np.zeros(_lead(space, batched), obs_dtype(space))
-    _fill(space, packed, batched)
+    packed = np.zeros(lead, obs_dtype(space))
+    for path, value in values.items():
+        at(packed, path)[...] = value
     return packed
 
 
@@ -171,37 +191,3 @@ def unpack(space: gym.Space[Any], array: Array) -> Any:
         return array
     values = {name: unpack(part, array[name]) for name, part in inner.items()}
     return tuple(values.values()) if isinstance(space, gym.spaces.Tuple) else values
-
-
-def env_form(space: gym.Space[Any], packed: Any) -> Any:
-    """Return one packed action as the environment takes it: dicts and tuples of ints and arrays."""
-    inner = parts(space)
-    if inner is None:
-        # A part without axes is a NumPy scalar, which a Box does not contain.
-        return int(packed) if isinstance(space, gym.spaces.Discrete) else np.asarray(packed)
-    values = {name: env_form(part, packed[name]) for name, part in inner.items()}
-    return tuple(values.values()) if isinstance(space, gym.spaces.Tuple) else values
-
-
-def _values(space: gym.Space[Any], batched: Any) -> Iterable[Any]:
-    """Return the parts of a batch in the order of the space, which a dict may not have."""
-    if isinstance(space, gym.spaces.Dict):
-        return [batched[name] for name in space.spaces]
-    return tuple(batched)
-
-
-def _lead(space: gym.Space[Any], batched: Any) -> tuple[int, ...]:
-    inner = parts(space)
-    if inner is None:
-        shape: tuple[int, ...] = np.shape(batched)
-        return shape[: len(shape) - len(obs_shape(space))]
-    return _lead(next(iter(inner.values())), next(iter(_values(space, batched))))
-
-
-def _fill(space: gym.Space[Any], out: Array, batched: Any) -> None:
-    inner = parts(space)
-    if inner is None:
-        out[...] = batched
-        return
-    for (name, part), value in zip(inner.items(), _values(space, batched), strict=True):
-        _fill(part, out[name], value)

@@ -10,7 +10,8 @@ from reach import SPACES
 from torch.distributions import Categorical, Normal, kl_divergence
 
 from skillweave.networks.heads import head_of
-from skillweave.spaces import JointCodec, action_codec, env_form, obs_dtype, put_observation
+from skillweave.policies.spaces import space_of
+from skillweave.spaces import JointCodec, action_codec, obs_dtype, put_observation
 
 SPACE = gym.spaces.Dict(
     arm=gym.spaces.Box(-2, 2, (2,), np.float32),
@@ -110,7 +111,7 @@ def test_actions_become_numbers_and_back(kind):
     assert again.dtype == batch.dtype
     codec.check(torch.from_numpy(units))
     for one in again:
-        assert space.contains(env_form(space, one))
+        assert space.contains(space_of(space).unpacked(one))
     if isinstance(codec, JointCodec):
         arm, grip = ("arm", "grip") if "arm" in again.dtype.names else ("0", "1")
         assert np.allclose(again[arm], batch[arm], atol=1e-6)

@@ -19,7 +19,7 @@ from skillweave.envs.infos import random_actions
 from skillweave.errors import DeclarationError, EnvError, SkillError
 from skillweave.networks.heads import head_of
 from skillweave.policies.spaces import space_of
-from skillweave.spaces import action_codec, env_form, obs_dtype, obs_shape, put_observation
+from skillweave.spaces import action_codec, obs_dtype, obs_shape, put_observation
 
 often = reports_every(40)
 SIZES = {"dict": 2, "tuple": 2, "nested": 2 + 6 + 5 + 4, "whole": 3 + 6}
@@ -92,8 +92,8 @@ def test_random_actions_are_allowed(kind):
     env.reset(seed=0)
     mask = np.tile(space_of(space).allowed(env.allowed()), (20, 1))
     for action in random_actions(space, 20, rng, mask):
-        assert space.contains(env_form(space, action))
-        assert mask[0][_numbers(env_form(space, action), space)].all()
+        assert space.contains(space_of(space).unpacked(action))
+        assert mask[0][_numbers(space_of(space).unpacked(action), space)].all()
 
 
 @pytest.mark.parametrize("name", ["PPO", "SelfImitationPPO", "recurrent"])

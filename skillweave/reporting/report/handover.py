@@ -18,6 +18,7 @@ from skillweave.errors import EnvError, SkillweaveError
 from skillweave.planning import CallLog, Handover
 from skillweave.planning.handover import before_each
 from skillweave.planning.neighbors import evenly
+from skillweave.policies.spaces import space_of
 from skillweave.reporting.report import charts
 from skillweave.reporting.report.calls import (
     coordinates,
@@ -31,7 +32,6 @@ from skillweave.reporting.report.page import Section
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.goals import goals_of
-from skillweave.spaces import env_form
 from skillweave.training.skill_report import end_cells
 from skillweave.types import Array
 
@@ -330,7 +330,7 @@ def _shot(log: CallLog, clip: _Clip) -> Shot:
     actions = log.action[np.concatenate(steps)[: before + clip.steps]]
     logged = np.concatenate([log.start[calls[:1]], log.next_obs[np.concatenate(steps)]])
     for action in actions:
-        if not space.contains(env_form(space, action)):
+        if not space.contains(space_of(space).unpacked(action)):
             raise EnvError(f"the log has the action {short(action)}, which does not exist")
 
     def same(t: int, obs: Array, step: RawStep | None) -> bool:
