@@ -17,9 +17,10 @@ from skillweave.algorithms.parameters import ParameterGroup, member_setting
 from skillweave.algorithms.schedules import is_schedule
 from skillweave.errors import DeclarationError
 from skillweave.networks.heads import ActionHead, JointHead
-from skillweave.networks.stacked import Inputs, Layout
+from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import CLIP, merge_moments, scale_of
+from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.ops.threads import torch_threads
 from skillweave.spaces import (
     ActionCodec,
@@ -284,7 +285,18 @@ class Algorithm:
         """
         flat = state.params[:, : self.acting.size].detach().to(device, copy=True)
         shift, scale = (None if x is None else x.to(device) for x in self.scaling(state))
-        return ActingParams(self.acting.views(flat), shift, scale)
+        numbers = self.exploration(state, progress)
+        extra = {name: x.to(device, copy=True) for name, x in numbers.items()}
+        return ActingParams(self.acting.views(flat), shift, scale, extra)
+
+    def exploration(self, state: Any, progress: float) -> dict[str, Tensor]:
+        """Return what exploration depends on now, such as ε, (P, …) each; by default nothing.
+
+        Args:
+            state: of P members.
+            progress: the share of the budget that is spent.
+        """
+        return {}
 
     def learning_params(self, state: Any) -> ActingParams:
         """Return the acting parameters of a ``state`` without copying, for learning."""
@@ -351,6 +363,30 @@ class Algorithm:
         ``generators`` has one generator per member.
         """
         return self.head.noise(generators, steps, batch)
+
+    def step_(
+        self,
+        state: Any,
+        loss: Tensor,
+        leaves: Views,
+        rate: Tensor,
+        max_norm: Tensor | None = None,
+        active: Tensor | None = None,
+    ) -> Tensor:
+        """Take one step of Adam on ``state.params``; return the unclipped gradient norm, (P,).
+
+        Args:
+            loss: (P,), of ``leaves``.
+            leaves: of ``layout``.
+            rate: (P,), the learning rate.
+            max_norm: (P,), gradients are scaled down to it; None: ``state.max_grad_norm``.
+            active: (P,) bool, members that change; None: all.
+        """
+        grad = self.layout.gradient(loss, leaves)
+        norm = clip_grad_norm_(grad, state.max_grad_norm if max_norm is None else max_norm)
+        moments, eps = (state.mu, state.nu, state.count), self.config.adam_eps
+        adam_(state.params, grad, *moments, rate, eps=eps, active=active)
+        return norm
 
     def update_obs_stats(self, state: Any, obs: Tensor, valid: Tensor | None = None) -> None:
         """Update the running moments of observations, in place.

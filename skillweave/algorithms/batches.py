@@ -35,6 +35,7 @@ class Column:
     """It is the same for every learner; recorded only where a learner needs it."""
 
 
+_RAW = Column(raw=True, rollout=False)
 SCHEMA: dict[str, Column] = {
     # Lead axes (T, N): T rows, in the order of time, of N environments.
     "obs": Column(),  # (T, N, *obs_shape)
@@ -57,25 +58,25 @@ SCHEMA: dict[str, Column] = {
     "call_start": Column(),  # (T, N) bool, a call starts here; for critics of skills
     # To judge a skill's reward, termination and success again later:
     "env_reward": Column(raw=True),  # (T, N) float32, the environment's own
-    "env_action": Column(raw=True, rollout=False),  # (T, N, …), in the environment's units
-    "env_terminated": Column(raw=True, rollout=False),  # (T, N) bool, the environment's own end
-    "env_truncated": Column(raw=True, rollout=False),  # (T, N) bool, the environment's own limit
-    "call_elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps of the call so far
+    "env_action": _RAW,  # (T, N, …), in the environment's units
+    "env_terminated": _RAW,  # (T, N) bool, the environment's own end
+    "env_truncated": _RAW,  # (T, N) bool, the environment's own limit
+    "call_elapsed": _RAW,  # (T, N) int64, steps of the call so far
     # In a trace alone. Under the path of a level (``inner/skill``), of its steps:
-    "elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps so far of the episode, or
+    "elapsed": _RAW,  # (T, N) int64, steps so far of the episode, or
     # of the call of a skill that learns apart
-    "end": Column(raw=True, rollout=False),  # (T, N) int8, ``CallEnd`` of these
-    "skill": Column(raw=True, rollout=False),  # (T, N) int64, the skill that acts
-    "goal": Column(raw=True, rollout=False),  # (T, N, *goal_shape), under the path of a skill
-    "call_end": Column(raw=True, rollout=False),  # (T, N) int8, ``CallEnd`` after the step
-    "call_length": Column(raw=True, rollout=False),  # (T, N) int64, the length that was chosen
-    "call_succeeded": Column(raw=True, rollout=False),  # (T, N) bool, where calls ended
-    "chances": Column(raw=True, rollout=False),  # (T, N, A) float32, of the guide's latest choice
-    "guide_allows": Column(raw=True, rollout=False),  # (T, N, A) bool, of next choices
+    "end": _RAW,  # (T, N) int8, ``CallEnd`` of these
+    "skill": _RAW,  # (T, N) int64, the skill that acts
+    "goal": _RAW,  # (T, N, *goal_shape), under the path of a skill
+    "call_end": _RAW,  # (T, N) int8, ``CallEnd`` after the step
+    "call_length": _RAW,  # (T, N) int64, the length that was chosen
+    "call_succeeded": _RAW,  # (T, N) bool, where calls ended
+    "chances": _RAW,  # (T, N, A) float32, of the guide's latest choice
+    "guide_allows": _RAW,  # (T, N, A) bool, of next choices
     # Under the path of a learner (``inner/selector/decided``), where it decided:
-    "decided": Column(raw=True, rollout=False),  # (T, N) bool, here
-    "allowed": Column(raw=True, rollout=False),  # (T, N, A) bool, among which choices
-    "state_before": Column(raw=True, rollout=False),  # (T, N, M) float32, its recurrent state
+    "decided": _RAW,  # (T, N) bool, here
+    "allowed": _RAW,  # (T, N, A) bool, among which choices
+    "state_before": _RAW,  # (T, N, M) float32, its recurrent state
 }
 """All columns, by name. A row is a step of an environment, or a decision with its whole call."""
 OF_STEP = {
@@ -94,7 +95,7 @@ INFO = "info."
 def column(name: str) -> Column:
     """Return a column of ``SCHEMA``, perhaps under a path; or the column of a key of ``info``."""
     if name.startswith(INFO):
-        return Column(raw=True, rollout=False)
+        return _RAW
     return SCHEMA.get(name) or SCHEMA[name_of(name)]
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.base import ActingParams, Device
+from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.config import DQN
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm, OffPolicyState, normal
@@ -92,20 +92,14 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         """Return the groups of state fields that have the shape of networks."""
         return [ParameterGroup(self.layout, (("network", self.net),), ("params", "target"))]
 
-    def acting_params(
-        self, state: State, progress: float = 1.0, device: Device = "cpu"
-    ) -> ActingParams:
-        """Copy the part that acting needs, with ε."""
+    def exploration(self, state: State, progress: float) -> dict[str, Tensor]:
+        """Return ε, (P, 1)."""
         cfg = self.config
-        params = super().acting_params(state, progress, device)
         spent = min(1.0, progress / max(cfg.exploration_fraction, 1e-9))
         start = cfg.exploration_initial_eps
         final = cfg.exploration_final_eps
         eps = 0.0 if cfg.noisy else start + spent * (final - start)
-        params.extra["epsilon"] = torch.full(
-            (len(state.params), 1), eps, dtype=torch.float32, device=device
-        )
-        return params
+        return {"epsilon": torch.full((len(state.params), 1), eps, **FLOAT)}
 
     def noise(
         self, generators: Sequence[torch.Generator], steps: int, batch: int

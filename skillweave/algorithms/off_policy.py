@@ -14,10 +14,8 @@ from skillweave.algorithms.base import AgentState, Algorithm
 from skillweave.algorithms.batches import Report, Sample
 from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.parameters import rate_now
-from skillweave.networks.stacked import Views
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.distributions import mask_logits
-from skillweave.ops.optim import adam_, clip_grad_norm_
 
 
 @dataclass
@@ -122,14 +120,6 @@ class OffPolicyAlgorithm(Algorithm):
     def rate(self, state: Any, progress: float) -> Tensor:
         """Return the learning rate now, (P,)."""
         return rate_now(self.config, state.learning_rate, progress)
-
-    def step_(self, state: Any, loss: Tensor, leaves: Views, rate: Tensor) -> Tensor:
-        """Take one gradient step on ``state.params``; return the unclipped gradient norm, (P,)."""
-        grad = self.layout.gradient(loss, leaves)
-        norm = clip_grad_norm_(grad, state.max_grad_norm)
-        moments = state.mu, state.nu, state.count
-        adam_(state.params, grad, *moments, rate, eps=self.config.adam_eps)
-        return norm
 
 
 def normal(generators: Sequence[torch.Generator], *shape: int) -> Tensor:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Device
+from skillweave.algorithms.base import ActingParams, AgentState, Algorithm
 from skillweave.algorithms.batches import Reference, Rehearsal, Report, Rollout
 from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.config import PPO
@@ -30,7 +30,7 @@ from skillweave.networks.stacked import Inputs, Layout, Views, take_rows
 from skillweave.ops.device import FLOAT, all_false
 from skillweave.ops.losses import approximate_kl, likelihood_ratio, ppo_policy_loss, value_loss
 from skillweave.ops.moments import explained_variance, masked_mean, normalize
-from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
+from skillweave.ops.optim import kl_adapted_rate
 from skillweave.ops.returns import gae
 from skillweave.spaces import ChoiceSpace
 from skillweave.types import Array
@@ -136,14 +136,10 @@ class PPOAlgorithm(Algorithm):
         action = self.head.act(dist_params, views.get("actor.log_std"), noise)
         return action, dist_params, memory
 
-    def acting_params(
-        self, state: State, progress: float = 1.0, device: Device = "cpu"
-    ) -> ActingParams:
-        """Copy the part that acting needs, with epsilon; see ``Algorithm.acting_params``."""
-        params = super().acting_params(state, progress, device)
-        if (epsilon := epsilon_now(self.config, progress, state.learning_rate)) is not None:
-            params.extra["epsilon"] = epsilon.to(device)
-        return params
+    def exploration(self, state: State, progress: float) -> dict[str, Tensor]:
+        """Return epsilon, (P, 1, 1), if there is one."""
+        epsilon = epsilon_now(self.config, progress, state.learning_rate)
+        return {} if epsilon is None else {"epsilon": epsilon}
 
     def to_env(self, action: Array) -> Array:
         """Convert actions (n, …) from policy units to the environment's."""
@@ -228,20 +224,9 @@ class PPOAlgorithm(Algorithm):
         """
         leaves = self.layout.leaves(state.params) if leaves is None else leaves
         loss, report = self.loss(leaves, state, batch, terms)
-        grad = self.layout.gradient(loss, leaves)
-        report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
         if active is not None and self._kl_limit is not None:
             active = active & (report["kl"] <= self._kl_limit)
-        adam_(
-            state.params,
-            grad,
-            state.mu,
-            state.nu,
-            state.count,
-            terms.rate,
-            eps=self.config.adam_eps,
-            active=active,
-        )
+        report["grad_norm"] = self.step_(state, loss, leaves, terms.rate, active=active)
         return report, active
 
     def loss(

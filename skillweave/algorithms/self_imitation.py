@@ -23,7 +23,6 @@ from skillweave.algorithms.rollouts import Cells, first_true
 from skillweave.errors import RunError
 from skillweave.networks.stacked import Views, take_rows
 from skillweave.ops.device import BOOL, FLOAT, all_false
-from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.ops.returns import gae
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
 
@@ -40,23 +39,12 @@ class State(PPOState):
 
     @property
     def rows(self) -> Rows:
-        """Return the kept rows."""
-        return Rows(self.kept_obs, self.kept_action, self.kept_mask, self.kept_return)
+        """Return the kept rows: ``obs``, ``action``, ``mask`` and ``return``."""
+        return {name: getattr(self, f"kept_{name}") for name in ("obs", "action", "mask", "return")}
 
 
-@dataclass(slots=True)
-class Rows:
-    """Rows of P members; fields as in ``State``."""
-
-    obs: Tensor
-    action: Tensor
-    mask: Tensor
-    returns: Tensor
-
-    def take(self, rows: Tensor) -> Rows:
-        """Select the rows with indices (P, B)."""
-        columns = (self.obs, self.action, self.mask, self.returns)
-        return Rows(*(take_rows(x, rows) for x in columns))
+Rows = dict[str, Tensor]
+"""Columns of P members' rows, (P, K, …) each; fields of ``State`` without ``kept_``."""
 
 
 class SelfImitationAlgorithm(PPOAlgorithm):
@@ -119,15 +107,14 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         good = known & (returns > value)
         if rollout.overridden is not None:
             good &= ~cells.flat(rollout.overridden)
-        new = Rows(obs, cells.flat(rollout.action), mask, returns)
+        action = cells.flat(rollout.action)
+        new = {"obs": obs, "action": action, "mask": mask, "return": returns}
         filled = torch.cat([good, state.kept], dim=1)
         latest = first_true(filled, state.kept.shape[1])
-        rows = joined(new, state.rows).take(latest)
         state.kept = take_rows(filled, latest)
-        state.kept_return = rows.returns
-        state.kept_obs = rows.obs
-        state.kept_action = rows.action
-        state.kept_mask = rows.mask
+        for name, old in state.rows.items():
+            rows = torch.cat([new[name], old], dim=1)
+            setattr(state, f"kept_{name}", take_rows(rows, latest))
 
     def imitate(
         self, state: State, rate: Tensor, rng: Sequence[torch.Generator]
@@ -143,7 +130,7 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         leaves = self.layout.leaves(state.params)
         rows = state.rows
         with torch.no_grad():
-            gain = (rows.returns - self.value(state, rows.obs)).clamp_min(0.0) * state.kept
+            gain = (rows["return"] - self.value(state, rows["obs"])).clamp_min(0.0) * state.kept
         total = gain.cumsum(1)
         count = state.kept.sum(1)
         # At most one pass over the kept rows: many passes over few rows would overfit them.
@@ -154,19 +141,10 @@ class SelfImitationAlgorithm(PPOAlgorithm):
             drawn = torch.stack([torch.rand(cfg.batch_size, generator=g, **FLOAT) for g in rng])
             place = torch.searchsorted(total, drawn.to(total.device) * total[:, -1:], right=True)
             # Rounding may lead beyond the last row; in a member without rows it always does.
-            batch = rows.take(place.clamp_max(total.shape[1] - 1))
-            grad = self.layout.gradient(self.imitation_loss(leaves, state, batch), leaves)
-            clip_grad_norm_(grad, state.max_grad_norm)
-            adam_(
-                state.params,
-                grad,
-                state.mu,
-                state.nu,
-                state.count,
-                rate,
-                eps=cfg.adam_eps,
-                active=active,
-            )
+            place = place.clamp_max(total.shape[1] - 1)
+            batch = {name: take_rows(x, place) for name, x in rows.items()}
+            loss = self.imitation_loss(leaves, state, batch)
+            self.step_(state, loss, leaves, rate, active=active)
         mean = total[:, -1] / count.clamp_min(1)
         return {"imitation_rows": count.to(gain.dtype), "imitation_gain": mean}
 
@@ -176,26 +154,16 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         Oh et al. 2018, eqs. 2 and 3; g is in deviations of returns, and at most 1 in the policy's
         loss, as in the authors' code.
         """
-        inputs = self.inputs(self.learning_params(state), batch.obs)
+        inputs = self.inputs(self.learning_params(state), batch["obs"])
         dist_params = self.actor_net(views, inputs)
         raw = self.critic_net(views, inputs)
         log_std = views.get("actor.log_std")
-        log_prob, _ = self.head.stats(dist_params, log_std, batch.mask, batch.action)
-        target = (batch.returns - state.return_mean) / state.return_scale
+        log_prob, _ = self.head.stats(dist_params, log_std, batch["mask"], batch["action"])
+        target = (batch["return"] - state.return_mean) / state.return_scale
         gain = (target - raw.squeeze(-1)).clamp_min(0.0)
         policy = -(log_prob * gain.detach().clamp_max(1.0)).mean(1)
         cfg = self.config
         return cfg.imitation_coef * policy + cfg.imitation_vf_coef * 0.5 * gain.square().mean(1)
-
-
-def joined(first: Rows, second: Rows) -> Rows:
-    """Concatenate the rows of both."""
-    return Rows(
-        obs=torch.cat([first.obs, second.obs], dim=1),
-        action=torch.cat([first.action, second.action], dim=1),
-        mask=torch.cat([first.mask, second.mask], dim=1),
-        returns=torch.cat([first.returns, second.returns], dim=1),
-    )
 
 
 def returns_of(rollout: Rollout) -> tuple[Tensor, Tensor]:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Device
+from skillweave.algorithms.base import ActingParams, AgentState, Algorithm
 from skillweave.algorithms.batches import Report, Rollout
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.parameters import ParameterGroup, epsilon_now, rate_now
@@ -31,7 +31,6 @@ from skillweave.networks.stacked import Inputs, Layout, take_rows
 from skillweave.ops.device import FLOAT, Constant
 from skillweave.ops.losses import value_loss
 from skillweave.ops.moments import explained_variance
-from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.ops.returns import gae
 from skillweave.spaces import obs_codec
 
@@ -107,15 +106,11 @@ class SkillCriticAlgorithm(Algorithm):
         keeps = self._keeps.get(name)
         return x if keeps is None else x * keeps.on(x.device).to(x.dtype)
 
-    def acting_params(
-        self, state: AgentState, progress: float = 1.0, device: Device = "cpu"
-    ) -> ActingParams:
-        """Copy the part that acting needs; ``trust`` multiplies values while skills learn."""
-        params = super().acting_params(state, progress, device)
+    def exploration(self, state: AgentState, progress: float) -> dict[str, Tensor]:
+        """Return ``trust``, which multiplies values while skills learn, (P, 1, 1)."""
         epsilon = epsilon_now(self.config, progress, state.learning_rate)
-        if epsilon is not None and progress < 1.0:  # at the end, values count in full
-            params.extra["trust"] = 1.0 - epsilon.to(device)
-        return params
+        # At the end, values count in full.
+        return {} if epsilon is None or progress >= 1.0 else {"trust": 1.0 - epsilon}
 
     def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Any:
         """Return None for each step: the critic is deterministic."""
@@ -167,9 +162,7 @@ class SkillCriticAlgorithm(Algorithm):
                     # A row weighs as much as one of Q, however few decisions the batch has.
                     decided = torch.where(take_rows(call_start, rows), q[..., -1], goal)
                     loss = loss + value_loss(decided, goal)
-                grad = self.layout.gradient(loss, leaves)
-                clip_grad_norm_(grad, torch.full_like(rate, cfg.max_grad_norm))
-                adam_(state.params, grad, state.mu, state.nu, state.count, rate, eps=cfg.adam_eps)
+                self.step_(state, loss, leaves, rate, torch.full_like(rate, cfg.max_grad_norm))
         explained = explained_variance(value, returns)
         return state, Report({"value_loss": loss.detach(), "explained_variance": explained})
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.actor_critic import ActorCriticAlgorithm, ActorCriticState, Critics
-from skillweave.algorithms.base import ActingParams, Device
+from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.config import TD3
 from skillweave.algorithms.off_policy import normal
@@ -69,13 +69,9 @@ class TD3Algorithm(ActorCriticAlgorithm):
         fields = self.fresh_networks(seeds)
         return State(**fields, target=fields["params"].clone())
 
-    def acting_params(
-        self, state: State, progress: float = 1.0, device: Device = "cpu"
-    ) -> ActingParams:
-        """Copy the part that acting needs, with the deviation of its noise."""
-        params = super().acting_params(state, progress, device)
-        params.extra["noise"] = state.exploration_noise[:, None, None].to(device, copy=True)
-        return params
+    def exploration(self, state: State, progress: float) -> dict[str, Tensor]:
+        """Return the deviation of the noise on actions, (P, 1, 1)."""
+        return {"noise": state.exploration_noise[:, None, None]}
 
     def act(
         self,

@@ -97,16 +97,16 @@ def test_the_loss_is_that_of_the_paper_written_plainly():
     mask = torch.ones(1, 4, 1, 3, dtype=torch.bool)
     mask[0, 1, 0, 2] = False
     algorithm.keep(state, rollout([[90.0, 80.0, 0.2, 70.0]], ends=[(1, 0), (3, 0)], mask=mask))
-    rows = state.rows.take(torch.arange(3)[None])
+    rows = {name: x[:, :3] for name, x in state.rows.items()}
     views = algorithm.layout.views(state.params)
     found = algorithm.imitation_loss(views, state, rows)
-    inputs = {"vector": rows.obs}
-    logits = algorithm.actor_net(views, inputs)[0].masked_fill(~rows.mask[0], -torch.inf)
-    gain = (rows.returns[0] - algorithm.critic_net(views, inputs)[0, :, 0]).clamp(min=0.0)
-    log_prob = logits.log_softmax(-1)[torch.arange(3), rows.action[0]]
+    inputs = {"vector": rows["obs"]}
+    logits = algorithm.actor_net(views, inputs)[0].masked_fill(~rows["mask"][0], -torch.inf)
+    gain = (rows["return"][0] - algorithm.critic_net(views, inputs)[0, :, 0]).clamp(min=0.0)
+    log_prob = logits.log_softmax(-1)[torch.arange(3), rows["action"][0]]
     want = 0.7 * -(log_prob * gain.clamp(max=1.0)).mean() + 0.3 * 0.5 * (gain**2).mean()
     torch.testing.assert_close(found, want[None])
-    assert not rows.mask[0].all(), "the row with a mask must be among them"
+    assert not rows["mask"][0].all(), "the row with a mask must be among them"
 
 
 def test_as_long_as_nothing_terminates_it_is_ppo():
