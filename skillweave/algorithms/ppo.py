@@ -1,7 +1,7 @@
 """PPO (Schulman et al. 2017) for P members at once; a single agent is P = 1.
 
-In the order of reading: State, init, act, value, update, learn, loss; then the terms of a loss and
-the samples of a rollout. The settings are ``config.PPO``. The weights that acted may be one update
+In the order of reading: State, init, act, value, update, learn, loss, the samples of a rollout;
+then the terms of a loss. The settings are ``config.PPO``. The weights that acted may be one update
 old, so the objective is the decoupled one of Hilton, Cobbe & Schulman 2022.
 """
 
@@ -161,7 +161,7 @@ class PPOAlgorithm(Algorithm):
         """Learn from the valid rows of a rollout, in place; ``rng`` orders the minibatches."""
         cfg = self.config
         terms = Terms.of(cfg, state, batch)
-        samples, metrics = samples_of(self, state, batch, terms)
+        samples, metrics = self.samples(state, batch, terms)
         rate = terms.rate
         count = samples.count
         limited = self._kl_limit is not None
@@ -314,6 +314,136 @@ class PPOAlgorithm(Algorithm):
         """Convert the critic's outputs (P, N, 1) to units of reward, (P, N)."""
         return raw.squeeze(-1) * state.return_scale + state.return_mean
 
+    @torch.no_grad()
+    def samples(
+        self, state: State, rollout: Rollout, terms: Terms
+    ) -> tuple[Samples, dict[str, Tensor]]:
+        """Return the samples of a rollout that ``loss`` needs, and metrics (P,)."""
+        cfg = self.config
+        memory = rollout.recurrent_state
+        starts = rollout.episode_start
+        if not self.memory_size:
+            memory = starts = None
+        cells = Cells(rollout, all_cells=memory is not None)
+        obs = cells.flat(rollout.obs)
+        valid = cells.flat_or_none(rollout.valid)
+        self.update_obs_stats(state, obs, valid)
+        params = self.learning_params(state)
+        inputs = self.inputs(params, obs)
+        if memory is not None:
+            inputs = {k: cells.unflat(v) for k, v in inputs.items()}
+        raw, after = self.run(self.critic_net, params.views, inputs, memory, starts)
+        value = self.in_rewards(state, raw)
+        following = self.next_values(state, params, rollout, cells.grid(value), after)
+        action = cells.flat(rollout.action)
+        mask = cells.flat_or_none(rollout.mask)
+        # Clipping and KL refer to the current policy, even if an older one, or one with epsilon,
+        # acted. With a high epsilon, a ratio of mixtures would let the policy collapse within the
+        # clip, because the policy can change only a share of 1 − epsilon of the mixture.
+        dist_params, _ = self.run(self.actor_net, params.views, inputs, memory, starts)
+        log_prob, _ = self.head.stats(dist_params, params.views.get("actor.log_std"), mask, action)
+        importance = likelihood_ratio(log_prob, self._acted(rollout, cells, mask, action))
+        # Values are those of the policy itself. Were they of its mixture with random choices,
+        # waiting for these would seem to be worth something, and the policy alone would wait for
+        # ever.
+        own_share = None if terms.openness is None else importance.clamp_max(1.0)
+        grid = gae(
+            rollout.reward,
+            rollout.discount,
+            cells.grid(value),
+            following,
+            rollout.last,
+            state.gae_lambda,
+            None if own_share is None else cells.grid(own_share),
+        )
+        advantage = cells.flat(grid)
+        returns = (advantage if own_share is None else own_share * advantage) + value
+        metrics = {"explained_variance": explained_variance(value, returns, valid)}
+        if cfg.normalize_returns:
+            self.update_return_stats(state, returns, valid)
+        mean, scale = state.return_mean, state.return_scale
+        own = valid  # the samples whose action is the policy's own, not a reflex's
+        if rollout.overridden is not None:
+            free = ~cells.flat(rollout.overridden)
+            own = free if valid is None else valid & free
+        if cfg.normalize_advantage:
+            advantage = normalize(advantage, own, min_std=cfg.min_advantage_std)
+        if rollout.advantage is not None:  # of the stage, in the same units
+            advantage = advantage + cells.flat(rollout.advantage)
+        samples = Samples(
+            inputs={} if memory is not None else inputs,
+            action=action,
+            log_prob=log_prob,
+            importance=importance,
+            advantage=advantage,
+            reference=self._reference(terms, rollout, cells),
+            target=(returns - mean) / scale,
+            old_value=None if cfg.clip_value is None else (value - mean) / scale,
+            mask=mask,
+            valid=valid,
+            own=own,
+            most=cells.most,
+        )
+        if memory is not None:
+            samples = samples.changed(cells.unflat)
+            samples.inputs = inputs
+            samples.memory = memory
+            samples.starts = starts
+        return samples, metrics
+
+    def _reference(self, terms: Terms, rollout: Rollout, cells: Cells) -> Tensor | None:
+        """Return dist_params (P, N, H) of the reference policy.
+
+        A recurrent reference runs along each trajectory. Its recurrent state before the rollout's
+        first row is unknown; the learner's, which is similar, takes its place.
+        """
+        if terms.reference is None:
+            return None
+        if terms.reference.params is None:
+            return cells.flat_or_none(rollout.guide)
+        params = terms.reference.params
+        inputs = self.inputs(params, cells.flat(rollout.obs))
+        if not self.memory_size:
+            return self.actor_net(params.views, inputs)
+        inputs = {k: cells.unflat(v) for k, v in inputs.items()}
+        memory, starts = rollout.recurrent_state, rollout.episode_start
+        return self.run(self.actor_net, params.views, inputs, memory, starts)[0]
+
+    def _acted(self, rollout: Rollout, cells: Cells, mask: Tensor | None, action: Tensor) -> Tensor:
+        """Return log-probabilities (P, N) of the actions under the policy that acted."""
+        assert rollout.dist_params is not None
+        log_std = rollout.log_std
+        if log_std is not None:
+            single = log_std.shape[2] == 1
+            log_std = (
+                log_std[:, 0] if single else cells.flat(log_std.expand(-1, cells.shape[0], -1, -1))
+            )
+        return self.head.stats(cells.flat(rollout.dist_params), log_std, mask, action)[0]
+
+    def next_values(
+        self,
+        state: State,
+        params: ActingParams,
+        rollout: Rollout,
+        value: Tensor,
+        after: Tensor | None,
+    ) -> Tensor:
+        """Return V(next_obs), (P, T, B): the next row's V(obs), (P, T, B), except at ends.
+
+        Args:
+            after: (P, T·B, M), the critic's recurrent state after each row, if it has one.
+        """
+
+        def at_ends(rows: Tensor) -> Tensor:
+            inputs = self.inputs(params, take_rows(rollout.next_obs.flatten(1, 2), rows))
+            if after is None:
+                raw = self.critic_net(params.views, inputs)
+            else:
+                raw, _ = self.critic_net.step(params.views, inputs, take_rows(after, rows))
+            return self.in_rewards(state, raw)
+
+        return values_after(value, rollout.last, at_ends)
+
 
 @dataclass(slots=True)
 class RehearsalRows:
@@ -346,151 +476,3 @@ class Terms:
         epsilon = epsilon_now(config, progress, rate)
         openness = None if epsilon is None else OPENNESS * epsilon.flatten()
         return cls(rate, ent_coef, rollout.reference, openness)
-
-
-@torch.no_grad()
-def samples_of(
-    agent: PPOAlgorithm, state: State, rollout: Rollout, terms: Terms
-) -> tuple[Samples, dict[str, Tensor]]:
-    """Return the samples of a rollout that ``loss`` needs, and metrics (P,)."""
-    cfg = agent.config
-    memory = rollout.recurrent_state
-    starts = rollout.episode_start
-    if not agent.memory_size:
-        memory = starts = None
-    cells = Cells(rollout, all_cells=memory is not None)
-    obs = cells.flat(rollout.obs)
-    valid = cells.flat_or_none(rollout.valid)
-    agent.update_obs_stats(state, obs, valid)
-    params = agent.learning_params(state)
-    inputs = agent.inputs(params, obs)
-    if memory is not None:
-        inputs = {k: cells.unflat(v) for k, v in inputs.items()}
-    raw, after = agent.run(agent.critic_net, params.views, inputs, memory, starts)
-    value = agent.in_rewards(state, raw)
-    following = next_values(agent, state, params, rollout, cells.grid(value), after)
-    reward = rollout.reward
-    discount = rollout.discount
-    last = rollout.last
-    action = cells.flat(rollout.action)
-    mask = cells.flat_or_none(rollout.mask)
-    # Clipping and KL refer to the current policy, even if an older one, or one with epsilon, acted.
-    # With a high epsilon, a ratio of mixtures would let the policy collapse within the clip,
-    # because the policy can change only a share of 1 − epsilon of the mixture.
-    dist_params, _ = agent.run(agent.actor_net, params.views, inputs, memory, starts)
-    log_prob, _ = agent.head.stats(dist_params, params.views.get("actor.log_std"), mask, action)
-    importance = likelihood_ratio(log_prob, _acted(agent, rollout, cells, mask, action))
-    # Values are those of the policy itself. Were they of its mixture with random choices, waiting
-    # for these would seem to be worth something, and the policy alone would wait forever.
-    own_share = None if terms.openness is None else importance.clamp_max(1.0)
-    grid = gae(
-        reward,
-        discount,
-        cells.grid(value),
-        following,
-        last,
-        state.gae_lambda,
-        None if own_share is None else cells.grid(own_share),
-    )
-    advantage = cells.flat(grid)
-    returns = (advantage if own_share is None else own_share * advantage) + value
-    metrics = {"explained_variance": explained_variance(value, returns, valid)}
-    if cfg.normalize_returns:
-        agent.update_return_stats(state, returns, valid)
-    mean = state.return_mean
-    scale = state.return_scale
-    own = _own(cells.flat_or_none(rollout.overridden), valid)
-    samples = Samples(
-        inputs={} if memory is not None else inputs,
-        action=action,
-        log_prob=log_prob,
-        importance=importance,
-        advantage=_advantage(agent, advantage, cells.flat_or_none(rollout.advantage), own),
-        reference=_reference(agent, terms, rollout, cells),
-        target=(returns - mean) / scale,
-        old_value=None if cfg.clip_value is None else (value - mean) / scale,
-        mask=mask,
-        valid=valid,
-        own=own,
-        most=cells.most,
-    )
-    if memory is not None:
-        samples = samples.changed(cells.unflat)
-        samples.inputs = inputs
-        samples.memory = memory
-        samples.starts = starts
-    return samples, metrics
-
-
-def _own(overridden: Tensor | None, valid: Tensor | None) -> Tensor | None:
-    """Return the samples whose action is the policy's own, not a reflex's, (P, N) bool."""
-    if overridden is None:
-        return valid
-    return ~overridden if valid is None else valid & ~overridden
-
-
-def _reference(agent: PPOAlgorithm, terms: Terms, rollout: Rollout, cells: Cells) -> Tensor | None:
-    """Return dist_params (P, N, H) of the reference policy.
-
-    A recurrent reference runs along each trajectory. Its recurrent state before the rollout's first
-    row is unknown; the learner's, which is similar, takes its place.
-    """
-    if terms.reference is None:
-        return None
-    if terms.reference.params is None:
-        return cells.flat_or_none(rollout.guide)
-    params = terms.reference.params
-    recurrent = bool(agent.memory_size)
-    inputs = agent.inputs(params, cells.flat(rollout.obs))
-    if recurrent:
-        inputs = {k: cells.unflat(v) for k, v in inputs.items()}
-    memory, starts = (rollout.recurrent_state, rollout.episode_start) if recurrent else (None, None)
-    return agent.run(agent.actor_net, params.views, inputs, memory, starts)[0]
-
-
-def _advantage(
-    agent: PPOAlgorithm, advantage: Tensor, of_stage: Tensor | None, counts: Tensor | None
-) -> Tensor:
-    """Return the normalised advantage plus the stage's, in the same units, (P, N)."""
-    if agent.config.normalize_advantage:
-        advantage = normalize(advantage, counts, min_std=agent.config.min_advantage_std)
-    return advantage if of_stage is None else advantage + of_stage
-
-
-def _acted(
-    agent: PPOAlgorithm, rollout: Rollout, cells: Cells, mask: Tensor | None, action: Tensor
-) -> Tensor:
-    """Return log-probabilities (P, N) of the actions under the policy that acted."""
-    assert rollout.dist_params is not None
-    log_std = rollout.log_std
-    if log_std is not None:
-        single = log_std.shape[2] == 1
-        log_std = (
-            log_std[:, 0] if single else cells.flat(log_std.expand(-1, cells.shape[0], -1, -1))
-        )
-    return agent.head.stats(cells.flat(rollout.dist_params), log_std, mask, action)[0]
-
-
-def next_values(
-    agent: PPOAlgorithm,
-    state: State,
-    params: ActingParams,
-    rollout: Rollout,
-    value: Tensor,
-    after: Tensor | None,
-) -> Tensor:
-    """Return V(next_obs), (P, T, B): the next row's V(obs), (P, T, B), except at ends.
-
-    Args:
-        after: (P, T·B, M), the critic's recurrent state after each row, if it has one.
-    """
-
-    def at_ends(rows: Tensor) -> Tensor:
-        inputs = agent.inputs(params, take_rows(rollout.next_obs.flatten(1, 2), rows))
-        if after is None:
-            raw = agent.critic_net(params.views, inputs)
-        else:
-            raw, _ = agent.critic_net.step(params.views, inputs, take_rows(after, rows))
-        return agent.in_rewards(state, raw)
-
-    return values_after(value, rollout.last, at_ends)

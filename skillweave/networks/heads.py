@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import torch
@@ -443,7 +443,6 @@ class ChoiceHead(JointHead):
     ) -> None:
         super().__init__(codec, std, squash)
         self.choices = codec.choices
-        self.goals = self.heads[1:]
 
     def masked(
         self, dist_params: Tensor, mask: Tensor | None, epsilon: Tensor | None = None
@@ -456,23 +455,28 @@ class ChoiceHead(JointHead):
         self, dist_params: Tensor, log_std: Tensor | None, mask: Tensor | None, action: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Compute log-probabilities of choices and the entropy; see ``ActionHead``."""
-        (choice, logits, _), *goals = self._split(dist_params, log_std)
+        choice, logits, _ = self._split(dist_params, log_std)[0]
         log_prob, entropy = choice.stats(logits, None, mask, self.codec.units(action, 0))
-        for i, (head, params, std) in enumerate(goals):
-            one, spread = head.stats(params, std, None, self.codec.units(action, 1 + i))
-            counts = chosen(action[..., 0], self.codec.owners[i])
-            log_prob = log_prob + torch.where(counts, one, 0.0)
-            entropy = entropy + torch.where(counts, spread, 0.0)
+        for one, spread in self._of_goals(dist_params, log_std, action):
+            log_prob, entropy = log_prob + one, entropy + spread
         return log_prob, entropy
 
     def of_goals(self, dist_params: Tensor, log_std: Tensor | None, action: Tensor) -> Tensor:
         """Compute log π(g | k) of choices (…, W), (…); 0 where the chosen skill has no goals."""
         log_prob = torch.zeros_like(dist_params[..., 0])
-        for i, (head, params, std) in enumerate(self._split(dist_params, log_std)[1:]):
-            one = head.stats(params, std, None, self.codec.units(action, 1 + i))[0]
-            counts = chosen(action[..., 0], self.codec.owners[i])
-            log_prob = log_prob + torch.where(counts, one, 0.0)
+        for one, _ in self._of_goals(dist_params, log_std, action):
+            log_prob = log_prob + one
         return log_prob
+
+    def _of_goals(
+        self, dist_params: Tensor, log_std: Tensor | None, action: Tensor
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield ``stats`` of each skill's goals, (…), 0 where another skill is chosen."""
+        for i, (head, params, std) in enumerate(self._split(dist_params, log_std)[1:]):
+            found = head.stats(params, std, None, self.codec.units(action, 1 + i))
+            counts = chosen(action[..., 0], self.codec.owners[i])
+            log_prob, entropy = (torch.where(counts, x, 0.0) for x in found)
+            yield log_prob, entropy
 
     def kl(
         self,

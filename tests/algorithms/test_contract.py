@@ -39,7 +39,7 @@ from skillweave.algorithms.config import (
     SelfImitationPPO,
 )
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy, make_algorithm
-from skillweave.algorithms.ppo import PPOAlgorithm, next_values
+from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.collector import Collector
 from skillweave.experience.learners import Alone
@@ -549,7 +549,7 @@ def test_the_value_after_an_end_remembers_what_led_to_it():
         out, after = net.sequence(views, {"vector": tr.obs}, own, tr.episode_start)
         params = algorithm.learning_params(state)
         value = out[..., 0]
-        following = next_values(algorithm, state, params, tr, value, after.flatten(1, 2))
+        following = algorithm.next_values(state, params, tr, value, after.flatten(1, 2))
         memory = own
         for t in range(16):
             memory = memory.masked_fill(tr.episode_start[:, t, :, None], 0.0)

@@ -15,7 +15,7 @@ from skillweave.algorithms import ppo
 from skillweave.algorithms.batches import Reference, Rollout
 from skillweave.algorithms.parameters import epsilon_now
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.algorithms.ppo import RehearsalRows, Terms, samples_of
+from skillweave.algorithms.ppo import RehearsalRows, Terms
 from skillweave.errors import DeclarationError
 from skillweave.networks.heads import ActionHead
 from skillweave.ops.distributions import with_epsilon
@@ -176,7 +176,7 @@ def test_with_a_floor_samples_are_weighted_and_the_clip_counts_from_the_policy_i
     _, own, _ = algorithm.act(bare, rollout.obs.flatten(1, 2), None, None)
     action = rollout.action.flatten(1, 2).long()[..., None]
     chosen = own.softmax(-1).gather(-1, action)[..., 0]
-    found, _ = samples_of(algorithm, state, rollout, Terms.of(config, state, rollout))
+    found, _ = algorithm.samples(state, rollout, Terms.of(config, state, rollout))
     torch.testing.assert_close(found.log_prob, chosen.log())
     torch.testing.assert_close(found.importance, chosen / (0.1 * chosen + 0.9 / 4))
 
@@ -240,7 +240,7 @@ def test_values_are_those_of_the_policy_without_its_random_choices():
     """The policy never takes the choice that is paid; its mixture with chance does."""
     algorithm, state = collapsed(learning_rate=1e-9, normalize_returns=False)
     rollout = of_two_choices(algorithm, state, 0, 1.0)
-    samples, _ = samples_of(algorithm, state, rollout, Terms.of(algorithm.config, state, rollout))
+    samples, _ = algorithm.samples(state, rollout, Terms.of(algorithm.config, state, rollout))
     assert rollout.action.any()
     torch.testing.assert_close(samples.target, torch.zeros_like(samples.target), atol=1e-4, rtol=0)
     paid = rollout.action.flatten(1) == 1

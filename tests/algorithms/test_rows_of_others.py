@@ -13,7 +13,7 @@ from skillweave import PPO, RNN, Network
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.batches import Reference, Rollout
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.algorithms.ppo import Terms, samples_of
+from skillweave.algorithms.ppo import Terms
 
 SEEN = gym.spaces.Box(-1, 1, (3,), np.float32)
 LINE, FORCE = gym.spaces.Discrete(4), gym.spaces.Box(-1, 1, (2,), np.float32)
@@ -106,7 +106,7 @@ def test_each_rollout_that_was_held_counts_by_the_deviation_it_was_acted_with():
     }
     each = torch.cat([x.log_std.expand(1, 1, B, 2) for x in (one, two)], 2)
     whole = Rollout(**both, log_std=each)
-    samples, _ = samples_of(algorithm, second, whole, Terms.of(algorithm.config, second, whole))
+    samples, _ = algorithm.samples(second, whole, Terms.of(algorithm.config, second, whole))
     importance = samples.importance.view(1, T, 2 * B)
     torch.testing.assert_close(importance[..., B:], torch.ones(1, T, B))
     std = [x.log_std[0, 0, 0].exp() for x in (one, two)]
@@ -121,7 +121,7 @@ def test_an_anchor_is_no_distance_from_the_policy_that_it_is_a_copy_of(space, ne
     algorithm, state = made(space, network, update_epochs=1)
     rollout = acted(algorithm, state)
     rollout.reference = Reference(algorithm.acting_params(state), torch.ones(1))
-    samples, _ = samples_of(algorithm, state, rollout, Terms.of(algorithm.config, state, rollout))
+    samples, _ = algorithm.samples(state, rollout, Terms.of(algorithm.config, state, rollout))
     assert samples.reference.shape[-1] == algorithm.head.width
     torch.testing.assert_close(samples.reference.reshape(1, T, B, -1), rollout.dist_params)
 
