@@ -22,7 +22,7 @@ from skillweave.errors import RunError
 from skillweave.experience.source import Recorded
 from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack
-from skillweave.training.loop import train
+from skillweave.training.loop import Loop
 from skillweave.training.replay_learner import learner_of
 
 N = 4
@@ -52,7 +52,7 @@ def source(rows: int = 100) -> Recorded:
 
 def test_a_learner_learns_from_recorded_rows_alone_and_a_budget_counts_updates() -> None:
     made, rows = learner(), source()
-    at = train(made, rows, Episodes(()), Seeds(5), 400, counts="updates")
+    at = Loop(made, rows, Episodes(()), Seeds(5), 400, counts="updates").run()
     assert (at.update, at.steps, rows.steps_made) == (400, 0, 0)
     (stack,) = made.stacks
     obs = torch.from_numpy(recorded()["obs"].reshape(1, -1, 4))
