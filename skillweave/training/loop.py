@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ from torch import Tensor
 from skillweave._internal import interrupts
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.batches import Batch
-from skillweave.experience.source import Source
+from skillweave.experience.group import Collectors
 from skillweave.ops.device import INT
 from skillweave.ops.threads import WorkThread, torch_threads
 from skillweave.spaces import to_tensor
@@ -113,17 +112,15 @@ class Loop:
     """One stage's training; states of the learner change."""
 
     learner: Learner
-    collectors: Source
+    collectors: Collectors
     """Fresh or already started."""
     episodes: Episodes
     """The latest episodes, for the metrics; new ones are added."""
     seeds: Seeds
     budget: int
-    """Environment steps, or updates."""
+    """Environment steps."""
     at: Progress = field(default_factory=Progress)
     """The counts so far."""
-    counts: Literal["steps", "updates"] = "steps"
-    """Unit of the budget; a source that makes no steps needs updates."""
     schedule_steps: int | None = None
     """The part of the budget at which schedules end; None: all of it."""
     skip_diverged: bool = False
@@ -179,7 +176,7 @@ class Loop:
             try:
                 self.collectors.start(self.seeds / "start")
                 self._request()
-                while self._spent < self.budget:
+                while self.at.steps < self.budget:
                     self._round()
                 self._report()
             finally:
@@ -193,10 +190,10 @@ class Loop:
         if self.on_calls is not None and collected.calls is not None:
             self.on_calls(collected.calls)
         self._report()
-        before, steps, update = self._spent, at.steps, at.update
+        before, update = at.steps, at.update
         at.steps += collected.steps
         at.update += 1
-        over = self._spent >= self.budget
+        over = at.steps >= self.budget
         self.episodes.extend(collected.episodes, collected.info_keys, collected.longest)
         if len(collected.begun_anew):
             learner.cut(collected.begun_anew)
@@ -204,13 +201,13 @@ class Loop:
         if learner.overlap and not over:
             self._request()  # before the parameters change
         every = learner.report_every
-        self._start_update(update, not every or over or crossed(every, before, self._spent))
+        self._start_update(update, not every or over or crossed(every, before, at.steps))
         if not learner.overlap:
             self._report()
             if not over:
                 self._request()
         if not over:
-            self._save_if_due(steps)
+            self._save_if_due(before)
 
     def _request(self) -> None:
         """Prepare the next request with the present parameters."""
@@ -250,13 +247,8 @@ class Loop:
             metrics |= report.summary
             self.on_tick(Tick(report.update, report.steps, since, self.at.seconds, metrics))
 
-    @property
-    def _spent(self) -> int:
-        """The part of the budget that is spent."""
-        return self.at.update if self.counts == "updates" else self.at.steps
-
     def _progress(self) -> float:
-        return min(1.0, self._spent / (self.schedule_steps or self.budget))
+        return min(1.0, self.at.steps / (self.schedule_steps or self.budget))
 
     def _take_time(self) -> None:
         self.at.seconds = time.perf_counter() - self._started
