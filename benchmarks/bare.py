@@ -13,7 +13,7 @@ from skillweave.experience.group import Collectors
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack
 from skillweave.training.learning_task import skill_task
-from skillweave.training.loop import train
+from skillweave.training.loop import Loop
 from skillweave.training.replay_learner import learner_of
 from skillweave.training.role import agent_role
 
@@ -27,20 +27,20 @@ def train_bare(
 ) -> Stack:
     """Train an agent; ``on_tick`` is called with every report."""
     learning_task = skill_task(agent_role(spec))
-    algorithm = make_algorithm(config, learning_task.observation_space, learning_task.action_space)
+    algorithm = make_algorithm(config, *learning_task.role.spaces)
     stack = Stack(algorithm, algorithm.init([seeds / "member" / 0]))
     learner = learner_of(stack, config.num_envs, seeds)
     acting = Acting([(algorithm, 1)], config.num_envs)
     collectors = Collectors([learning_task.collector(config.num_envs, acting)])
     try:
-        train(
+        Loop(
             learner,
             collectors,
             Episodes(),
             seeds,
             steps,
             on_tick=lambda tick: on_tick(tick, stack),
-        )
+        ).run()
     finally:
         collectors.close()
     return stack

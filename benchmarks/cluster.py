@@ -322,19 +322,17 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
 
     from skillweave._internal.seeding import Seeds
     from skillweave.algorithms.policy import make_algorithm
+    from skillweave.experience.acting import Acting
     from skillweave.training.learner import RolloutLearner, Stack
     from skillweave.training.learning_task import skill_task
     from skillweave.training.role import agent_role
-    from skillweave.training.trainer import _collector
 
     found: dict[str, Any] = {}
     for name, env in (("CartPole", lambda: gym.make("CartPole-v1")), ("MiniGrid", grid)):
         each, rows, count = 16, 128, 2
         learning_task = skill_task(agent_role(EnvSpec(env, engine="sync")))
         config = small(count, each, rows)
-        algorithm = make_algorithm(
-            config, learning_task.observation_space, learning_task.action_space
-        )
+        algorithm = make_algorithm(config, *learning_task.role.spaces)
         learner = RolloutLearner(Stack(algorithm, algorithm.init([Seeds(0)])), Seeds(1))
 
         def make(
@@ -343,7 +341,7 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
             learning_task: Any = learning_task,
             algorithm: Any = algorithm,
         ) -> Any:
-            return _collector(learning_task, algorithm, num_envs, first)
+            return learning_task.collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
 
         alone = make(each, 0)
         alone.start(Seeds(0))

@@ -65,7 +65,7 @@ from skillweave.skills import ready_policy
 from skillweave.skills.skill_set import SkillSet
 from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack
-from skillweave.training.loop import train
+from skillweave.training.loop import Loop
 from skillweave.training.replay_learner import learner_of
 from skillweave.types import Array
 
@@ -249,7 +249,7 @@ def learnt(skills: list[Skill], config: Any, goal: int, steps: int, seed: int) -
     collectors.counted = Counted(len(skills))
     learner = learner_of(stack, config.num_envs, seeds / "learner", row_steps=CALL)
     try:
-        train(learner, collectors, Episodes(), seeds, steps)
+        Loop(learner, collectors, Episodes(), seeds, steps).run()
     finally:
         collectors.close()
     return stack.algorithm, stack.state, collectors.counted

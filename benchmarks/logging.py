@@ -31,7 +31,7 @@ from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import roles_of
 from skillweave.planning.recorder import Recorder
 from skillweave.training.evaluation import evaluate
-from skillweave.training.learning_task import selector_task
+from skillweave.training.learning_task import LearningTask
 
 ENVS = 16
 LIMIT = 0.10
@@ -101,14 +101,14 @@ def collecting(run: Any, engine: Any, rows: int) -> Callable[[bool], float]:
     assert isinstance(policy, HierarchyPolicy)
     role = roles_of(run.hierarchy)["selector"]
     role = replace(role, spec=replace(role.spec, engine=engine))
-    task = selector_task(role, Calling(policy.skills))
-    algorithm = make_algorithm(sw.PPO(), task.observation_space, task.action_space)
+    task = LearningTask(role, Calling(policy.skills))
+    algorithm = make_algorithm(sw.PPO(), *role.spaces)
     params = algorithm.acting_params(algorithm.init([Seeds(0)]))
     spaces = role.spec.spaces.observation, role.spec.spaces.action
 
     def timed(log: bool) -> float:
         told = replace(task, log_calls=() if log else None)
-        collector = told.learners_collector(ENVS, Acting([(algorithm, 1)], ENVS))
+        collector = told.collector(ENVS, Acting([(algorithm, 1)], ENVS))
         recorder = Recorder(policy.skills, spaces, ENVS, latest=10_000)
         collector.start(Seeds(1))
         began, steps = time.process_time(), 0

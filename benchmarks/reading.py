@@ -28,7 +28,7 @@ from skillweave.experience.group import Collectors
 from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack
 from skillweave.training.learning_task import skill_task
-from skillweave.training.loop import train
+from skillweave.training.loop import Loop
 from skillweave.training.replay_learner import learner_of
 from skillweave.training.role import agent_role
 
@@ -43,12 +43,12 @@ ROUNDS: dict[str, tuple[str, Any]] = {
 def one_round(env: str, config: Any, steps: int) -> Callable[[], None]:
     """Return a function that collects and learns, everything made before."""
     learning_task = skill_task(agent_role(EnvSpec(env, engine="sync")))
-    algorithm = make_algorithm(config, learning_task.observation_space, learning_task.action_space)
+    algorithm = make_algorithm(config, *learning_task.role.spaces)
     stack = Stack(algorithm, algorithm.init([Seeds(0)]))
     learner = learner_of(stack, config.num_envs, Seeds(0))
     acting = Acting([(algorithm, 1)], config.num_envs)
     collectors = Collectors([learning_task.collector(config.num_envs, acting)])
-    return lambda: void(train(learner, collectors, Episodes(), Seeds(0), steps))
+    return lambda: void(Loop(learner, collectors, Episodes(), Seeds(0), steps).run())
 
 
 def void(_: Any) -> None:

@@ -21,7 +21,7 @@ from skillweave import DQN, SAC, Agent, Apart, EnvSpec, Hierarchy, Network, Toge
 from skillweave._internal import interrupts
 from skillweave.evolution import Evolution
 from skillweave.runs.directory import RunDirectory
-from skillweave.training.loop import _Loop
+from skillweave.training.loop import Loop
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
 
@@ -145,17 +145,17 @@ def at_random_places(share: float, seed: int, stop_after: int | None = None) -> 
         The updates at which checkpoints were written.
     """
     rng, places = np.random.default_rng(seed), list[int]()
-    save = _Loop._save
+    save = Loop._save
 
-    def noted(self: _Loop) -> None:
+    def noted(self: Loop) -> None:
         save(self)
         places.append(self.at.update)
         if len(places) == stop_after:
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_Loop, "is_due", lambda self, before: rng.random() < share)
-        patch.setattr(_Loop, "_save", noted)
+        patch.setattr(Loop, "is_due", lambda self, before: rng.random() < share)
+        patch.setattr(Loop, "_save", noted)
         yield places
 
 

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -32,6 +33,7 @@ from toys import ASKS, Echo
 from skillweave import DQN, SAC, TD3, Hierarchy, Network, recipes
 from skillweave.cli import main
 from skillweave.cli.overrides import apply_overrides
+from skillweave.experience.learners import Alone
 from skillweave.hierarchy import training
 from skillweave.hierarchy.roles import roles_of
 from skillweave.runs.directory import RunDirectory
@@ -329,17 +331,24 @@ REPLAYERS = {
 }
 
 
+class EchoTask(LearningTask):
+    """Its environments are a toy."""
+
+    def engine(self, num_envs: int, first: int = 0) -> Any:
+        return self.role.spec.made(num_envs)  # type: ignore[attr-defined]
+
+
 def stage_of(name: str, save_buffer: bool = True) -> Stage:
     config, shows, asks = REPLAYERS[name]
     config = dataclasses.replace(config, save_buffer=save_buffer)
 
     def learning_task(_: Any) -> LearningTask:
-        space, acts = Echo(1, shows, asks).observation_space, ASKS[asks][0]
-
-        def collector(num_envs: int, acting: Any, first: int = 0, shared: bool = False) -> Any:
-            return Echo(num_envs, shows, asks).collector(acting)
-
-        return LearningTask("Echo", space, acts, collector)
+        spaces = Echo(1, shows, asks).observation_space, ASKS[asks][0]
+        spec = SimpleNamespace(name="Echo", made=lambda n: Echo(n, shows, asks))
+        role: Any = SimpleNamespace(
+            spec=spec, spaces=spaces, row_steps=1, margin=None, guide_kl=None
+        )
+        return EchoTask(role, Alone())
 
     return Stage("echo", "agent", config, 650, learning_task)
 

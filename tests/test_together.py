@@ -37,7 +37,7 @@ from skillweave.runs.comparison import SAMPLING
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
 from skillweave.schema import as_json
-from skillweave.training import joint
+from skillweave.training import agents
 from skillweave.training.episodes import Episodes
 from skillweave.training.skill_report import SkillReport
 from skillweave.training.stage_log import StageLog, success_rate
@@ -156,7 +156,7 @@ def test_learners_with_the_same_settings_share_an_algorithm_and_learn_as_if_they
         made.append(config)
         return make_algorithm(config, *spaces)
 
-    monkeypatch.setattr(joint, "make_algorithm", noted)
+    monkeypatch.setattr(agents, "make_algorithm", noted)
     slow = replace(ON, learning_rate=1e-4)
 
     class Slow(Left):
@@ -170,7 +170,7 @@ def test_learners_with_the_same_settings_share_an_algorithm_and_learn_as_if_they
 
     rates = [ON.learning_rate, slow.learning_rate]
     assert sorted(train("shared")) == sorted([*rates, ON.learning_rate]), "the selector's is apart"
-    monkeypatch.setattr(joint.JointAgents, "_equal_algorithm", lambda *settings: None)
+    monkeypatch.setattr(agents.Agents, "_equal_algorithm", lambda *settings: None)
     assert len(train("apart")) == 4
     assert_same(tmp_path / "shared", tmp_path / "apart")
 

@@ -33,7 +33,7 @@ from skillweave.skills.skill_set import SkillSet
 from skillweave.spaces import pack
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Learner, Stack
-from skillweave.training.loop import Progress, Saved, resume, train
+from skillweave.training.loop import Loop, Progress, Saved
 from skillweave.training.replay_learner import ReplayLearner, learner_of, store_of
 from skillweave.types import Array
 
@@ -502,12 +502,13 @@ class Training:
         return self.learner.stacks[0].state
 
     def run(self, budget: int, **how: Any) -> Progress:
-        """Train it, as ``train`` does."""
-        return train(self.learner, self.collectors, self.episodes, self.seeds, budget, **how)
+        """Train it by a ``Loop``."""
+        return Loop(self.learner, self.collectors, self.episodes, self.seeds, budget, **how).run()
 
     def resume(self, extra: dict[str, Any], at: Progress) -> Array:
         """Stand where a checkpoint was written, at these steps."""
-        return resume(self.learner, self.collectors, self.episodes, extra, at)
+        parts = self.learner, self.collectors, self.episodes, self.seeds
+        return Loop(*parts, at.steps, at).restore(extra)
 
 
 def training(
@@ -584,21 +585,25 @@ def goes_on(
     saved: list[Saved] = []
     ticks: list[Tick] = []
 
+    states: list[Any] = []
+    cut = training(algorithm, make())
+
     def cut_at_second(found: Saved) -> None:
-        saved.append(replace(found, at=replace(found.at), states=[copied(found.states[0])]))
+        saved.append(replace(found, at=replace(found.at)))
+        states.append(copied(cut.state))
         if len(saved) == 2:
             raise Cut
 
     how: dict[str, Any] = {"checkpoint_every": every, "on_tick": ticks.append}
     with contextlib.suppress(Cut):
-        training(algorithm, make()).run(budget, on_checkpoint=cut_at_second, **how)
+        cut.run(budget, on_checkpoint=cut_at_second, **how)
 
     def resumed(extra: dict[str, Any]) -> Training:
-        at, state = saved[1].at, copied(saved[1].states[0])
+        at, state = saved[1].at, copied(states[1])
         now = Progress(at.update, at.steps)
         found = training(algorithm, make(), state=state, goes_on_at=at.steps)
         assert not len(found.resume(extra, now))
-        found.run(budget, resume_from=now, on_checkpoint=lambda saved: None, **how)
+        found.run(budget, at=now, on_checkpoint=lambda saved: None, **how)
         return found
 
     state = resumed(saved[1].extra).state

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from skillweave import Agent, Skill
 from skillweave.api import Run
@@ -19,12 +18,12 @@ from skillweave.runs.initial_policies import (
     learners_of_run,
     record_initial_policies,
 )
+from skillweave.training.agents import Agents
 from skillweave.training.learning_task import skill_task
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.role import agent_role
 from skillweave.training.stage import Stage
 from skillweave.training.stage_run import StageRun
-from skillweave.training.trainer import OneAgent
 
 
 @dataclass
@@ -61,16 +60,17 @@ class Flat(Agent):
         return Run(self, path, policy)
 
 
-class _FlatLearner(OneAgent):
+class _FlatLearner(Agents):
     """Evaluates on the task itself."""
 
     def __init__(self, flat: Flat, stage: StageRun) -> None:
         super().__init__(stage)
         self._flat = flat
 
-    def open(self) -> Any:
+    def open(self) -> None:
         """Make the environments and the agent."""
-        fresh, manifest = super().open(), self.stage.run.manifest
+        super().open()
+        manifest = self.stage.run.manifest
         self.evaluation = PeriodicEvaluation(
             skill_task(agent_role(self._flat.spec)),
             self.stage.seeds,
@@ -79,4 +79,3 @@ class _FlatLearner(OneAgent):
             self.stage.config.num_envs,
         )
         self._resources.callback(self.evaluation.close)
-        return fresh

@@ -24,28 +24,24 @@ class FitnessEnvs:
 
     def __init__(self, learning_task: LearningTask, episodes: int, num_envs: int) -> None:
         rounds = -(-episodes // num_envs)
-        self._episodes = episodes
-        self._collector = learning_task.collector(-(-episodes // rounds), None)
+        self._episodes, self._who = episodes, learning_task.who
+        self._engine = learning_task.engine(-(-episodes // rounds))
 
     @property
     def steps_made(self) -> int:
         """Return the number of steps of all members in these environments."""
-        return self._collector.engine.steps_made
+        return self._engine.steps_made
 
     def score(self, policy: AgentPolicy, seeds: Seeds) -> float:
         """Return a policy's mean return of the episodes of these seeds; −inf if not finite."""
-        eval_envs = self._collector
-        total = self._episodes
-        returns = np.concatenate(
-            [
-                episodes_of(
-                    policy, eval_envs, seeds, first, min(eval_envs.num_envs, total - first)
-                )[:, RETURN]
-                for first in range(0, total, eval_envs.num_envs)
-            ]
-        )
+        total, each = self._episodes, self._engine.num_envs
+        played = [
+            episodes_of(policy, self._who, self._engine, seeds, first, min(each, total - first))
+            for first in range(0, total, each)
+        ]
+        returns = np.concatenate(played)[:, RETURN]
         return float(returns.mean()) if np.isfinite(returns).all() else -np.inf
 
     def close(self) -> None:
         """Release the environments."""
-        self._collector.close()
+        self._engine.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,12 +22,13 @@ from skillweave.evolution.stacks import Member, grouped, join, split
 from skillweave.experience.acting import Acting
 from skillweave.experience.collector import Collector, joined_from, parted
 from skillweave.experience.group import Collectors
+from skillweave.experience.learners import Calling
 from skillweave.ops.device import resolve_device
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, EpisodeTally, Tick
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.learning_task import LearningTask
-from skillweave.training.loop import Progress, train
+from skillweave.training.loop import Loop, Progress
 from skillweave.training.replay_learner import ReplayLearner, check_counts, store_of
 from skillweave.types import Array, prefixed, unprefixed
 
@@ -58,18 +60,20 @@ class Part:
         count: int,
         first: int = 0,
     ) -> None:
-        self.spaces = spaces_of(learning_task)
-        self.row_steps = learning_task.row_steps
+        self.spaces = learning_task.role.spaces
+        self.row_steps = learning_task.role.row_steps
         self._seeds = seeds
         self._first = first
         each = config.num_envs
         self.replays = make_algorithm(config, *self.spaces).store == "replay"
+        who = learning_task.who
+        if isinstance(who, Calling):
+            learning_task = replace(learning_task, who=replace(who, keep_rewards=self.replays))
         self.places: list[Collector] = []
         """The collectors in which members act: an heir continues its place's open episodes."""
         try:
             for i in range(first, first + count):
-                place = learning_task.learners_collector(each, None, i * each, self.replays)
-                self.places.append(place)
+                self.places.append(learning_task.collector(each, None, i * each))
         except SkillweaveError as error:
             self.close()
             raise too_many(error, f"{count * each} of them to train in") from error
@@ -89,98 +93,66 @@ class Part:
         seeds: Seeds,
         on_tick: OnGenerationTick,
     ) -> None:
-        """Train members, one for each place, until each has ``until`` steps."""
+        """Train members, one for each place, until each has ``until`` steps.
+
+        With rollouts one stack learns after another; from replay all at once, from one store. A
+        recurrent member begins a generation with an empty state, because the open one is of
+        another network.
+        """
         for i, place in enumerate(self.places):
             place.start(self._seeds / "start" / (self._first + i))
         groups = grouped(members, self.spaces)
-        if self.replays:
-            self._train_side_by_side(groups, until, schedule_steps, seeds, on_tick)
-        else:
-            self._train_one_by_one(groups, until, schedule_steps, seeds, on_tick)
-
-    def _train_one_by_one(
-        self,
-        groups: list[list[Member]],
-        until: int,
-        schedule_steps: int,
-        seeds: Seeds,
-        on_tick: OnGenerationTick,
-    ) -> None:
-        """Train stack after stack, for algorithms with rollouts.
-
-        A recurrent member begins a generation with an empty state, because the open one is of
-        another network.
-        """
         first = spent = 0
-        for i, group in enumerate(groups, self._first):
-            stack = self._stack(group)
-            start = sum(m.steps for m in group)
-            count = len(group)
+        at_once = [groups] if self.replays else [[group] for group in groups]
+        for i, some in enumerate(at_once, self._first):
+            stacks = [self._stack(group) for group in some]
+            learning = [member for group in some for member in group]
+            start, count = sum(m.steps for m in learning), len(learning)
+            own = seeds if self.replays else seeds / i
+            learner = self._learner(stacks, learning, own)
             places = self.places[first : first + count]
-            joined = self._together(places, [stack])
-            end = train(
-                RolloutLearner(stack, seeds / i),
+            joined = self._together(places, stacks)
+            end = Loop(
+                learner,
                 Collectors([joined], count),
                 self.episodes,
-                seeds / i,
+                own,
                 until * count,
-                resume_from=Progress(steps=start),
+                Progress(self.rounds, start),
                 schedule_steps=schedule_steps * count,
                 skip_diverged=True,
                 on_tick=_counting_from(on_tick, spent - start),
-            )
+            ).run()
             parted(joined, places)
-            self._unstack(stack, group)
+            for stack, group in zip(stacks, some, strict=True):
+                split(stack.algorithm, state_to(stack.state, "cpu"), group, self.spaces)
+            for k, member in enumerate(learning):
+                member.steps += (end.steps - start + k) // count
             spent += end.steps - start
             first += count
-            _count(group, end.steps - start)
+            if isinstance(learner, ReplayLearner):
+                self._kept, self.rounds = learner.counts(), end.update
 
-    def _train_side_by_side(
-        self,
-        groups: list[list[Member]],
-        until: int,
-        schedule_steps: int,
-        seeds: Seeds,
-        on_tick: OnGenerationTick,
-    ) -> None:
-        """Train all stacks at once from one store."""
-        members = [m for group in groups for m in group]
-        stacks = [self._stack(group) for group in groups]
-        start = sum(m.steps for m in members)
-        count = len(members)
+    def _learner(
+        self, stacks: list[Stack], members: Sequence[Member], seeds: Seeds
+    ) -> RolloutLearner | ReplayLearner:
+        """Return the learner of stacks of these members."""
+        if not self.replays:
+            (stack,) = stacks
+            return RolloutLearner(stack, seeds)
         self.store = self.store or self._make_store(members)
+        start = sum(m.steps for m in members)
         learner = ReplayLearner(
             stacks, self.store, seeds, row_steps=self.row_steps, goes_on_at=start
         )
         if self._kept:
             learner.load(self._kept)
-        joined = self._together(self.places, stacks)
-        end = train(
-            learner,
-            Collectors([joined], count),
-            self.episodes,
-            seeds,
-            until * count,
-            resume_from=Progress(self.rounds, start),
-            schedule_steps=schedule_steps * count,
-            skip_diverged=True,
-            on_tick=_counting_from(on_tick, -start),
-        )
-        parted(joined, self.places)
-        for stack, group in zip(stacks, groups, strict=True):
-            self._unstack(stack, group)
-        self._kept = learner.counts()
-        self.rounds = end.update
-        _count(members, end.steps - start)
+        return learner
 
     def _stack(self, group: list[Member]) -> Stack:
         """Join members to one stack, on the device of learning."""
         algorithm, state = join(group, self.spaces, self._made)
         return Stack(algorithm, state_to(state, resolve_device(algorithm.config.device)))
-
-    def _unstack(self, stack: Stack, group: list[Member]) -> None:
-        """Copy each member's part of a stack's state to the member."""
-        split(stack.algorithm, state_to(stack.state, "cpu"), group, self.spaces)
 
     def _together(self, places: Sequence[Collector], stacks: Sequence[Stack]) -> Collector:
         """Return the places as one collector, in which the stacks act."""
@@ -258,20 +230,9 @@ def too_many(error: SkillweaveError, needed: str) -> EnvError:
     )
 
 
-def spaces_of(learning_task: LearningTask) -> tuple[Any, Any]:
-    """Return the spaces of the algorithms: (observation space, action space)."""
-    return learning_task.observation_space, learning_task.action_space
-
-
 def _counting_from(on_tick: OnGenerationTick, before: int) -> Callable[[Tick], None]:
     """Return a listener that adds ``before`` steps to the ticks of one loop."""
     return lambda tick: on_tick(before + tick.steps, tick.metrics)
-
-
-def _count(members: Sequence[Member], steps: int) -> None:
-    """Divide the steps of a loop among the members."""
-    for i, member in enumerate(members):
-        member.steps += (steps + i) // len(members)
 
 
 def policy_of(member: Member, spaces: tuple[Any, Any]) -> AgentPolicy:

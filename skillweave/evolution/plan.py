@@ -15,7 +15,7 @@ from skillweave.evolution.part import too_many
 from skillweave.evolution.stage import EvolvingPopulation
 from skillweave.runs.manifest import StageEntry, Target
 from skillweave.schema import fitted
-from skillweave.training.joint import agents_of
+from skillweave.training.agents import Agents
 from skillweave.training.stage_run import MakeLearner, StageLearner, StageRun
 from skillweave.workers.placement import LOCAL, Placement
 
@@ -77,8 +77,8 @@ def make_learner(stages: list[StageEntry], evolve: Evolve, where: Placement = LO
 
     def make(stage: StageRun) -> StageLearner:
         if stage.entry.evolution is None:
-            return agents_of(stage, where.collectors)
-        how = by_stage.get(stage.name)
+            return Agents(stage, where.collectors)
+        how = by_stage.get(stage.entry.name)
         return EvolvingPopulation(stage, None if how is None else how.selection, where)
 
     return make

@@ -8,15 +8,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import AlgorithmConfig
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.evolution.config import Evolution
 from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.mutation import mutate, random_config
-from skillweave.evolution.part import OnGenerationTick, Part, policy_of, spaces_of
+from skillweave.evolution.part import OnGenerationTick, Part
 from skillweave.evolution.selection import select
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member, copy, grouped
@@ -45,7 +43,7 @@ class Population:
     ) -> None:
         self.members = members
         self.evolution = evolution
-        self.spaces = spaces_of(learning_task)
+        self.spaces = learning_task.role.spaces
         self.next_number = len(members)
         self.part = part or Part(learning_task, members[0].config, seeds, len(members))
 
@@ -60,7 +58,7 @@ class Population:
     ) -> Population:
         """Create the first generation, each member with its own weights."""
         members = []
-        spaces = spaces_of(learning_task)
+        spaces = learning_task.role.spaces
         for i in range(evolution.population):
             settings = config
             if evolution.start == "random":
@@ -89,22 +87,6 @@ class Population:
     def fitness(self, eval_envs: FitnessEnvs, seeds: Seeds) -> Array:
         """Return each member's mean return in the same episodes; −inf if it has diverged."""
         return self.part.fitness(self.members, eval_envs, seeds)
-
-    def state(self) -> dict[str, Tensor]:
-        """Return the state of the environments for a checkpoint."""
-        return self.part.state()
-
-    def resume(self, saved: dict[str, Tensor], store: dict[str, Tensor]) -> Array:
-        """Restore a ``state``; return the environments that were reset, (k,)."""
-        return self.part.restore(saved, self.members, store)
-
-    def close(self) -> None:
-        """Release the environments."""
-        self.part.close()
-
-    def policy(self, member: Member) -> AgentPolicy:
-        """Return a member's policy."""
-        return policy_of(member, self.spaces)
 
     def evolve(self, fitness: Array, seeds: Seeds) -> None:
         """Replace the members by the next generation."""

@@ -7,7 +7,7 @@ generation. Results depend on the number of parts, but not on their workers.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -32,25 +32,9 @@ Sent = tuple[int, dict[str, Any], int, dict[str, Array]]
 """A member as a message: number, settings as JSON, steps, tensors of its state."""
 
 
-@dataclass(frozen=True)
-class Training:
-    """A part's task of training; see ``Part.train``."""
-
-    members: Sequence[Sent]
-    until: int
-    schedule_steps: int
-    seeds: Seeds
-
-
-@dataclass(frozen=True)
-class Trained:
-    """The result of a part's training."""
-
-    states: list[dict[str, Array]]
-    steps: list[int]
-    ticks: list[tuple[int, dict[str, float]]]
-    tally: EpisodeTally
-    """Of all episodes at this part so far."""
+Task = tuple[list[Sent], int, int, Seeds]
+"""The members that train at a part, and the next three arguments of ``Part.train``."""
+Ticks = list[tuple[int, dict[str, float]]]
 
 
 class Parts:
@@ -85,7 +69,7 @@ class Parts:
         self.tally = EpisodeTally()
         """The tally of logged keys of ``info``."""
         make = partial(_make_host, learning_task, _alone(config), seeds, self._bounds, episodes)
-        self._workers = make_workers(make, parts, learning_task.name)
+        self._workers = make_workers(make, parts, learning_task.role.spec.name)
         self._closed = False
 
     def train(
@@ -98,15 +82,16 @@ class Parts:
     ) -> None:
         """Train members until each has ``until`` steps; report ticks when all parts are done."""
         groups = self._divided(members)
-        tasks = [Training(_sent(group), until, schedule_steps, seeds) for group in groups]
+        tasks: list[Task] = [(_sent(group), until, schedule_steps, seeds) for group in groups]
         before = 0
         self.tally = EpisodeTally()
-        for group, trained in zip(groups, self._workers.ask("train", tasks), strict=True):
-            for steps, metrics in trained.ticks:
+        results = self._workers.ask("train", tasks)
+        for group, (trained, ticks, tally) in zip(groups, results, strict=True):
+            for steps, metrics in ticks:
                 on_tick(before + steps, dict(metrics))
-            self.tally.add(trained.tally)
-            before += sum(trained.steps) - sum(m.steps for m in group)
-            for member, state, steps in zip(group, trained.states, trained.steps, strict=True):
+            self.tally.add(tally)
+            for member, (_, _, steps, state) in zip(group, trained, strict=True):
+                before += steps - member.steps
                 member.state = type(member.state)(**_tensors(state))
                 member.steps = steps
 
@@ -127,7 +112,8 @@ class Parts:
         """Restore a ``state``; return the environments that were reset, (k,)."""
         arrays = {k: v.numpy() for k, v in saved.items()}
         states = split_states(arrays, len(self._bounds) - 1)
-        return self._columns(self._workers.stand(states))
+        ids = zip(self._workers.stand(states), self._bounds[:-1], strict=True)
+        return np.concatenate([rows + first * self._each for rows, first in ids])
 
     def close(self) -> None:
         """End the workers, if they run."""
@@ -138,12 +124,6 @@ class Parts:
     def _divided(self, members: Sequence[Member]) -> list[Sequence[Member]]:
         return [members[first:end] for first, end in pairwise(self._bounds)]
 
-    def _columns(self, ids: Sequence[Array]) -> Array:
-        """Convert environments' numbers in each part to numbers in the population."""
-        return np.concatenate(
-            [rows + first * self._each for rows, first in zip(ids, self._bounds[:-1], strict=True)]
-        )
-
 
 class PartHost:
     """A part at its worker; arguments and results are plain data."""
@@ -152,16 +132,12 @@ class PartHost:
         self._part = part
         self._eval_envs = eval_envs
 
-    def train(self, task: Training) -> Trained:
-        """Train members."""
-        members = _received(task.members, self._part.spaces)
-        ticks = list[Any]()
-        self._part.train(
-            members, task.until, task.schedule_steps, task.seeds, lambda *tick: ticks.append(tick)
-        )
-        states = [_arrays(m.state) for m in members]
-        steps = [m.steps for m in members]
-        return Trained(states, steps, ticks, self._part.tally)
+    def train(self, task: Task) -> tuple[list[Sent], Ticks, EpisodeTally]:
+        """Train members; return them, the ticks, and the tally of all episodes here so far."""
+        sent, until, schedule_steps, seeds = task
+        members, ticks = _received(sent, self._part.spaces), Ticks()
+        self._part.train(members, until, schedule_steps, seeds, lambda *tick: ticks.append(tick))
+        return _sent(members), ticks, self._part.tally
 
     def fitness(self, task: tuple[Sequence[Sent], Seeds]) -> tuple[Array, int]:
         """Return the members' fitness, and the environment steps of its measurement."""
@@ -194,8 +170,7 @@ def _make_host(
     number: int,
 ) -> PartHost:
     seed_global_generators(seeds / "global" / number)
-    first = bounds[number]
-    end = bounds[number + 1]
+    first, end = bounds[number], bounds[number + 1]
     part = Part(learning_task, config, seeds, end - first, first)
     return PartHost(part, FitnessEnvs(learning_task, episodes, config.num_envs))
 

@@ -22,7 +22,7 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
 from skillweave.errors import RunError
 from skillweave.evolution.config import Evolution, evolution_from_json
 from skillweave.evolution.fitness import FitnessEnvs
-from skillweave.evolution.part import spaces_of
+from skillweave.evolution.part import policy_of
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member
@@ -59,14 +59,10 @@ class EvolvingPopulation:
     """
 
     def __init__(self, stage: StageRun, selection: Any = None, where: Placement = LOCAL) -> None:
-        self.stage = stage
-        self.run = stage.run
-        self.seeds = stage.seeds
-        label = f"{stage.run.path}: stage {stage.name!r}"
+        self.entry, self.run, self.seeds = stage.entry, stage.run, stage.seeds
+        self.task, self.config = stage.learning_task, stage.config
+        label = f"{stage.run.path}: stage {stage.entry.name!r}"
         self.evolution = evolution_from_json(stage.entry.evolution or {}, label, selection)
-        self.config = stage.config
-        self.budget = stage.budget
-        self.target = stage.target
         self.best: Best | None = None
         self.done = 0
         """The number of complete generations."""
@@ -77,46 +73,33 @@ class EvolvingPopulation:
 
     def open(self) -> None:
         """Create the environments of fitness measurements."""
-        self.eval_envs = FitnessEnvs(
-            self.stage.learning_task, self.evolution.episodes, self.config.num_envs
-        )
+        task, episodes = self.task, self.evolution.episodes
+        self.eval_envs = FitnessEnvs(task, episodes, self.config.num_envs)
         self._open.callback(self.eval_envs.close)
-        self.spaces = spaces_of(self.stage.learning_task)
-        self.parts = self._parts()
-        if self.parts is not None:
+        self.parts: Parts | None = None  # members train in this process
+        if (parts := self.entry.workers) > 1:
+            how = task, self.config, self.seeds, self.evolution.population, parts, episodes
+            self.parts = Parts(self._where.workers, *how)
             self._open.callback(self.parts.close)
 
-    def go_on(self, state: None, extra: dict[str, Tensor], log: StageLog) -> None:
+    def go_on(self, extra: dict[str, Tensor], log: StageLog) -> None:
         """Restore a checkpoint, whose members are in ``extra``."""
         self.log = log
         if extra:
             self._restore(extra)
         else:
             self.population = Population.fresh(
-                self.config, self.evolution, self.stage.learning_task, self.seeds, self.parts
+                self.config, self.evolution, self.task, self.seeds, self.parts
             )
-        self._open.callback(self.population.close)
+        part = self.population.part
+        self._open.callback(part.close)
         if extra:
-            self._resume_episodes(extra)
+            saved, store = unprefixed("collector", extra), unprefixed("store", extra)
+            ids = resumed(log, lambda: part.restore(saved, self.population.members, store))
+            log.report_reset(len(ids), part.num_envs)
         self._started: float = time.perf_counter() - log.at.seconds
 
-    def _parts(self) -> Parts | None:
-        """Return the parts at workers; None: members train in this process."""
-        parts = self.stage.entry.workers
-        evolution = self.evolution
-        if parts <= 1:
-            return None
-        return Parts(
-            self._where.workers,
-            self.stage.learning_task,
-            self.config,
-            self.seeds,
-            evolution.population,
-            parts,
-            evolution.episodes,
-        )
-
-    def train(self, log: StageLog) -> dict[str, AgentPolicy]:
+    def train(self) -> dict[str, AgentPolicy]:
         """Train all generations; return the best policy, by the stage's name.
 
         Raises:
@@ -126,9 +109,8 @@ class EvolvingPopulation:
             self.generation()
             if interrupts.requested() and not self.over:
                 interrupts.stop()
-        log.report_absent(self.population.part.tally, over=True)
-        log.report_endless(self.population.part.tally)
-        return {self.stage.name: self._finish()}
+        self.log.report_episodes(self.population.part.tally, over=True)
+        return {self.entry.name: self._finish()}
 
     def states(self) -> dict[str, Any]:
         """Return no states: only the policy of the best member is kept."""
@@ -144,15 +126,14 @@ class EvolvingPopulation:
 
         It ends when the target is reached, the budget is spent, or a callback requests it.
         """
-        spent = self.done > 0 and self.log.at.steps >= self.budget
+        spent = self.done > 0 and self.log.at.steps >= self.entry.budget
         early = self._good or spent or self.log.stop_requested
         return early or self.done >= self.evolution.generations
 
     @property
     def _good(self) -> bool:
         """Return whether the target is reached."""
-        target = self.target
-        best = self.best
+        target, best = self.entry.target, self.best
         return target is not None and best is not None and best.fitness >= target.at_least
 
     def generation(self) -> None:
@@ -174,8 +155,7 @@ class EvolvingPopulation:
         self.log.at.steps += self.fitness_steps
         self._note(fitness)
         self.done += 1
-        self.log.report_absent(self.population.part.tally, over=False)
-        self.log.report_endless(self.population.part.tally)
+        self.log.report_episodes(self.population.part.tally, over=False)
         if self.log.stop_requested:
             return  # no checkpoint: a run resumed from the previous one arrives here again
         if not self.over:
@@ -197,11 +177,12 @@ class EvolvingPopulation:
             self.log.stopped()
         elif self.done < generations:
             self.log.message(
-                f"its budget of {self.budget:,} steps is spent after {self.done} of {generations} "
-                "generations: measuring fitness counts, too. Give it more steps, or fewer episodes"
+                f"its budget of {self.entry.budget:,} steps is spent after {self.done} of "
+                f"{generations} generations: measuring fitness counts, too. Give it more steps, or "
+                "fewer episodes"
             )
         best = self.best
-        self.log.entry.winner = Winner(best.number, best.fitness, best.generation, self.done)
+        self.entry.winner = Winner(best.number, best.fitness, best.generation, self.done)
         return self.best.policy
 
     def _until(self, spent: int) -> tuple[int, int]:
@@ -213,7 +194,7 @@ class EvolvingPopulation:
         left = self.evolution.generations - self.done
         members = len(self.population.members)
         now = self.population.steps // members
-        training = self.budget - spent - left * self.fitness_steps
+        training = self.entry.budget - spent - left * self.fitness_steps
         return now + max(1, training // (left * members)), now + max(1, training // members)
 
     @property
@@ -227,7 +208,7 @@ class EvolvingPopulation:
         # The latest of equal ones: it has learnt for longer.
         if self.best is None or fitness.max() >= self.best.fitness:
             member = self.population.members[int(fitness.argmax())]
-            policy = self.population.policy(member)
+            policy = policy_of(member, self.population.spaces)
             self.best = Best(float(fitness.max()), member.number, self.done, policy)
 
     def _note(self, fitness: Array) -> None:
@@ -235,7 +216,7 @@ class EvolvingPopulation:
         members = self.population.members
         best = self.best.number if self.best and self.best.generation == self.done else None
         self.run.lineage.append(
-            lineage_of(self.stage.name, self.done, members, fitness, self.evolution, best)
+            lineage_of(self.entry.name, self.done, members, fitness, self.evolution, best)
         )
         lost = [str(m.number) for m, f in zip(members, fitness, strict=True) if f == -np.inf]
         if lost:
@@ -252,7 +233,7 @@ class EvolvingPopulation:
 
     def _save(self) -> None:
         """Write a checkpoint of the whole population, to continue from."""
-        tensors = prefixed("collector", self.population.state())
+        tensors = prefixed("collector", self.population.part.state())
         for i, member in enumerate(self.population.members):
             tensors |= prefixed(str(i), vars(member.state))
         store = self.population.part.store
@@ -273,24 +254,14 @@ class EvolvingPopulation:
             ],
             entry,
         )
-        self.log.save(None, tensors | prefixed("best", weights))
-
-    def _resume_episodes(self, tensors: dict[str, Tensor]) -> None:
-        """Restore the environments and their episodes from a checkpoint."""
-        population = self.population
-        saved = unprefixed("collector", tensors)
-        store = unprefixed("store", tensors)
-        ids = resumed(self.log, lambda: population.resume(saved, store))
-        self.log.report_reset(len(ids), population.part.num_envs)
+        self.log.save(tensors | prefixed("best", weights))
 
     def _restore(self, tensors: dict[str, Tensor]) -> None:
         """Restore the population from a checkpoint."""
-        where = str(self.run.path)
+        where, name = str(self.run.path), self.entry.name
         at = self.log.at.population
         if at is None:
-            raise RunError(
-                f"{where}: the checkpoint of stage {self.stage.name!r} has no population"
-            )
+            raise RunError(f"{where}: the checkpoint of stage {name!r} has no population")
         self.done = at.generation
         self.fitness_steps = at.fitness_steps
         if (best := at.best) is not None:
@@ -300,8 +271,7 @@ class EvolvingPopulation:
             self._restored(entry, unprefixed(str(i), tensors), f"{where}: member {i}")
             for i, entry in enumerate(at.members)
         ]
-        learning_task = self.stage.learning_task
-        self.population = Population(members, self.evolution, learning_task, self.seeds, self.parts)
+        self.population = Population(members, self.evolution, self.task, self.seeds, self.parts)
         self.population.part.rounds = at.rounds
         self.population.next_number = at.next_number
 
@@ -311,7 +281,7 @@ class EvolvingPopulation:
         Heirs have parents that had not diverged. The last generation has no heirs.
         """
         config = config_from_json(entry.config)
-        algorithm = make_algorithm(config, *self.spaces)
+        algorithm = make_algorithm(config, *self.task.role.spaces)
         like = algorithm.init([self.seeds])
         groups = algorithm.parameter_groups()
         state = state_from(tensors, like, where, groups, may_diverge=self.over)

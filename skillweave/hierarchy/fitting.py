@@ -119,8 +119,7 @@ def _fitted(policy: Policy, role: Role, who: str) -> Policy:
                 f"{who}: its policy is a hierarchy, which sees and writes all of its environment: "
                 "leave out sees and acts"
             )
-    spaces = role.observation_space, role.action_space
-    return fitted_to_skill(policy, role.skill, *spaces, who, env)
+    return fitted_to_skill(policy, role.skill, *role.spaces, who, env)
 
 
 def fitted_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide | None:

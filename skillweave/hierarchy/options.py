@@ -111,7 +111,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self._hierarchy.begin(self._memory, self._all, choice)
         world = World((Seeds(self._seed) / "call" / self._calls).numpy())
         self._calls += 1
-        obs = self._obs
+        obs = self._obs.copy()
         next_obs = np.empty_like(obs)
         reward = np.zeros(n)
         call_return = np.zeros(n)
@@ -122,7 +122,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         rows = np.arange(n)
         while len(rows):
             self._hierarchy.check_lengths(self._memory, LONGEST_EPISODE)
-            rows_obs = obs if len(rows) == n else obs[rows]
+            rows_obs = obs[rows]
             allowed = allowed_rows(self.engine.mask(), rows)
             action = self._policy.act(self._memory, rows, rows_obs, Turn(world, allowed))
             raw = self.engine.step(action, None if len(rows) == n else rows)
@@ -135,10 +135,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             self._policy.observe(self._memory, rows, step)
             over = self._memory["end"][rows] != RUNNING
             ended = raw.terminated | raw.truncated
-            if len(rows) == n:
-                obs = raw.next_obs.copy()
-            else:
-                obs[rows] = raw.next_obs
+            obs[rows] = raw.next_obs
             if ended.any():
                 terminated[rows] = raw.terminated
                 truncated[rows] = raw.truncated
@@ -184,9 +181,6 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             final[i] = unpack(self.single_observation_space, next_obs[i])
         return {"final_obs": final, "_final_obs": ended}
 
-    def _named(self, choice: Array) -> str:
-        return self.skills.skills[int(self.skills.skill_of(choice))].name
-
     def _choices(self, actions: Any) -> Array:
         """Return skills with goals as choices (N,); no number of a goal changes."""
         space = self.single_action_space
@@ -222,11 +216,11 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         wrong = skill[(skill < 0) | (skill >= count)]
         if len(wrong):
             raise DeclarationError(f"action {int(wrong[0])} is no skill: there are {count}")
-        if self._mask is not None and not self._mask[np.arange(self.num_envs), skill].all():
-            row = int(np.flatnonzero(~self._mask[np.arange(self.num_envs), skill])[0])
-            name = self._named(skill[row])
+        if self._mask is not None and not (may := self._mask[self._all, skill]).all():
+            row = int(may.argmin())
+            one = self.skills.skills[int(self.skills.skill_of(skill[row]))]
             raise DeclarationError(
-                f"skill {name!r} may not start in environment {row}: its initiation() is False "
+                f"skill {one.name!r} may not start in environment {row}: its initiation() is False "
                 "there; choose among info['action_mask']"
             )
         return skill

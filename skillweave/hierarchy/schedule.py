@@ -23,13 +23,7 @@ from skillweave.policies.parts import OBSERVATION
 from skillweave.skills.goal_spaces import goal_part
 from skillweave.skills.skill_set import SkillSet
 from skillweave.spaces import obs_codec
-from skillweave.training.learning_task import (
-    JointTask,
-    LearningTask,
-    joint_task,
-    selector_task,
-    skill_task,
-)
+from skillweave.training.learning_task import LearningTask, skill_task
 from skillweave.training.role import Role
 from skillweave.training.stage import TOGETHER, Policies, Stage, Together, target_of
 
@@ -125,8 +119,8 @@ def _together(roles: Roles, level: Level, budget: int) -> Stage:
     """Return the stage in which skills and selectors of a level learn from the same steps."""
     settings = level.together
 
-    def learning_task(policies: Policies) -> JointTask:
-        return _joint_task(roles, level, learning_set(roles, level, policies))
+    def learning_task(policies: Policies) -> LearningTask:
+        return _calling_task(roles, level, learning_set(roles, level, policies))
 
     ready = level.ready_selector is not None
     config = level.algorithm if ready else _with_epsilon(level.selector, settings)
@@ -155,11 +149,17 @@ def _together(roles: Roles, level: Level, budget: int) -> Stage:
     )
 
 
-def _joint_task(roles: Roles, level: Level, skills: SkillSet) -> JointTask:
-    """Return the task in which the selector of a level calls ``skills``, which may learn, too."""
-    below = {role.path: role for role in roles.below(level.path)}
+def _calling_task(
+    roles: Roles, level: Level, skills: SkillSet, *, together: bool = True
+) -> LearningTask:
+    """Return the task in which the selector of a level calls ``skills``, and learns.
+
+    Args:
+        together: others learn beside it, from the same steps.
+    """
+    below = {role.path: role for role in roles.below(level.path)} if together else None
     who = Calling(skills, active_guide(roles, level), level.as_skill)
-    return joint_task(level.selector_path, below, who)
+    return LearningTask(roles[level.selector_path], who, below)
 
 
 def _plays_alone(roles: Roles, level: Level) -> bool:
@@ -288,9 +288,7 @@ def _selector_stage(roles: Roles, level: Level, config: AlgorithmConfig, budget:
 
     def learning_task(policies: Policies) -> LearningTask:
         skills = level.skill_set({p: policy_at(roles, policies, p) for p in level.skills})
-        if interrupts:
-            return _joint_task(roles, level, skills)
-        return selector_task(role, Calling(skills, active_guide(roles, level), level.as_skill))
+        return _calling_task(roles, level, skills, together=interrupts)
 
     return Stage(
         role.path,

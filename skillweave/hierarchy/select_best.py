@@ -120,16 +120,16 @@ def _scores(
         )
 
     def sampling(name: str) -> Evaluation:
-        return score(with_sampling(roles, *SAMPLING[name]), after)
+        return score(roles.changed(lambda x: _with_sampling(x, *SAMPLING[name])), after)
 
-    scores = {"greedy": sampling("greedy")}
     skills_open, selector_open = open_choices(roles, level)
+    names = ["greedy"]
     if entry.greedy_judged and skills_open:
-        scores["skills_sample"] = sampling("skills_sample")
+        names.append("skills_sample")
     if entry.greedy_judged and selector_open:
         # Under a greedy selector that is stuck, no episode shows how skills should act.
-        for name in ("selector_samples", "both_sample")[: len(scores)]:
-            scores[name] = sampling(name)
+        names += ("selector_samples", "both_sample")[: len(names)]
+    scores = {name: sampling(name) for name in names}
     if entry.compared:
         scores["before"] = score(resolve_greedy(roles, run), before)
     return scores
@@ -164,11 +164,6 @@ def _exploration(entry: StageEntry, scores: Mapping[str, Evaluation]) -> list[st
 def resolve_greedy(roles: Roles, run: RunDirectory) -> Roles:
     """Return the table with every choice of greedy or sampling set as the run records it."""
     return roles.changed(lambda level: _with_sampling(level, *_sampling(run, level.path)))
-
-
-def with_sampling(roles: Roles, skills: bool, selector: bool) -> Roles:
-    """Return the table whose ``skills`` and ``selector`` sample wherever this leaves it open."""
-    return roles.changed(lambda level: _with_sampling(level, skills, selector))
 
 
 def _with_sampling(level: Level, skills: bool, selector: bool) -> Level:

@@ -27,8 +27,8 @@ from skillweave.runs.manifest import Manifest
 from skillweave.runs.trackers import Listener
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import as_recorded
+from skillweave.training.agents import Agents
 from skillweave.training.defaults import TrainDefaults
-from skillweave.training.joint import agents_of
 from skillweave.training.options import CallReports
 from skillweave.training.plain_agent import Declared, PlainAgent
 from skillweave.training.stage import Policies, Stage
@@ -99,7 +99,7 @@ def train(
     declaration: Declared,
     run: RunDirectory,
     listeners: tuple[Listener, ...] = (),
-    make_learner: MakeLearner = agents_of,
+    make_learner: MakeLearner = Agents,
     done: Mapping[str, Any] | None = None,
 ) -> Policy:
     """Train, or finish training, the stages of a run; return the policy.

@@ -82,7 +82,20 @@ class TrainCallback(Listener):
         steps: int,
         metrics: Mapping[str, float | None],
     ) -> None:
-        event = self._event(kind, name, steps, metrics)
+        stages = self._run.manifest.stages
+        done = [s for s in stages if s.done]
+        budget = self._run.stage(name).budget
+        passed = sum(s.budget for s in done) + min(steps, budget)
+        event = TrainEvent(
+            kind=kind,
+            stage=name,
+            steps=steps,
+            budget=budget,
+            total_steps=sum(s.steps or 0 for s in done) + steps,
+            progress=passed / sum(s.budget for s in stages),
+            metrics={k: float(v) for k, v in metrics.items() if v is not None},
+            run_dir=self._run.path,
+        )
         try:
             result = self._function(event)
         except Exception as error:
@@ -97,28 +110,6 @@ class TrainCallback(Listener):
             raise
         if isinstance(result, bool | np.bool_) and not result:
             self.stopped = True
-
-    def _event(
-        self,
-        kind: Literal["report", "checkpoint"],
-        name: str,
-        steps: int,
-        metrics: Mapping[str, float | None],
-    ) -> TrainEvent:
-        stages = self._run.manifest.stages
-        done = [s for s in stages if s.done]
-        budget = self._run.stage(name).budget
-        passed = sum(s.budget for s in done) + min(steps, budget)
-        return TrainEvent(
-            kind=kind,
-            stage=name,
-            steps=steps,
-            budget=budget,
-            total_steps=sum(s.steps or 0 for s in done) + steps,
-            progress=passed / sum(s.budget for s in stages),
-            metrics={k: float(v) for k, v in metrics.items() if v is not None},
-            run_dir=self._run.path,
-        )
 
 
 def check_callback(callback: Any) -> None:

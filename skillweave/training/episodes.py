@@ -118,7 +118,6 @@ class Tick:
     since: int  # steps at the previous report
     seconds: float  # of training, in this process and in those before it
     metrics: dict[str, float]
-    state: Any
 
 
 def to_numbers(

@@ -6,6 +6,7 @@ A pool of environments is faster; all its episodes start from one seed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace as replaced
 from typing import Any, TypeVar
 
@@ -320,66 +321,51 @@ def evaluate(
         raise DeclarationError("info names keys to record with calls: set log_calls=True, too")
     spec = replaced(env if isinstance(env, EnvSpec) else EnvSpec(env), engine=engine)
     with global_generators(Seeds(seed) / "evaluation"):
-        keys = tuple(info) if log_calls else None
-        return _evaluate(policy, spec, episodes, seed, deterministic, n, max_steps, watch, keys)
+        own_limit, threshold, pooled = _describe(spec)
+        with closing(make_engine(spec, episodes if pooled else min(n, episodes))) as envs:
+            spaces = envs.observation_space, envs.action_space
+            policy = _fitted(policy, spaces, spec.name)
+            seeds: Any = episode_seeds(seed, episodes)
+            if pooled:  # its environments take no seeds of their own
+                seeds = seeds[0] % POOL_SEEDS
+            most = max_steps or longest_evaluation(own_limit)
+            starts = SeededEpisodes(envs, seeds, most)
+            first, rng = starts.obs[:1].copy(), np.random.default_rng([seed, 1])
+            moments = play(policy, starts, deterministic=deterministic, rng=rng, seed=seed)
+            if max_steps is None and own_limit is None:
+                moments = _with_notice(moments, spec.name, most)
+            calls = PlayedCalls(
+                policy,
+                spaces,
+                info=tuple(info),
+                own_rewards=True,
+                steps=log_calls,
+                spec=spec if log_calls else None,
+            )
+            evaluation = _scored(policy, episodes, moments, watch, threshold, calls)
+            if log_calls:
+                logs = calls.logs([-1] * episodes if pooled else seeds)
+                evaluation = replaced(evaluation, details=replaced(evaluation.details, logs=logs))
+            if spec.check_seed and not pooled and episodes > envs.num_envs:
+                _check_starts_again(envs, seeds[0], first, spec.name)
+            return evaluation
 
 
-def _evaluate(
-    policy: Policy,
-    spec: EnvSpec,
-    episodes: int,
-    seed: int,
-    deterministic: bool,
-    n: int,
-    max_steps: int | None,
-    watch: Callable[[Played], None] | None,
-    info: tuple[str, ...] | None,
-) -> Evaluation:
-    own_limit, threshold, pooled = _describe(spec)
-    envs = make_engine(spec, episodes if pooled else min(n, episodes))
-    try:
-        spaces = envs.observation_space, envs.action_space
-        if isinstance(policy, Foreign):
-            policy = policy.bind(*spaces, "the policy")
-        check_spaces(policy, *spaces, "the policy", spec.name)
-        if isinstance(policy, Foreign):
-            policy.try_out()
-        seeds: Any = episode_seeds(seed, episodes)
-        if pooled:  # its environments take no seeds of their own
-            seeds = seeds[0] % POOL_SEEDS
-        most = max_steps or longest_evaluation(own_limit)
-        starts = SeededEpisodes(envs, seeds, most)
-        first = starts.obs[:1].copy()
-        moments = play(
-            policy,
-            starts,
-            deterministic=deterministic,
-            rng=np.random.default_rng([seed, 1]),
-            seed=seed,
-        )
-        if max_steps is None and own_limit is None:
-            moments = _with_notice(moments, spec.name, most)
-        how: dict[str, Any] = {"steps": False} if info is None else {"info": info, "spec": spec}
-        calls = PlayedCalls(policy, spaces, own_rewards=True, **how)
-        evaluation = _scored(policy, episodes, moments, watch, threshold, calls)
-        if info is not None:
-            logs = calls.logs([-1] * episodes if pooled else seeds)
-            evaluation = replaced(evaluation, details=replaced(evaluation.details, logs=logs))
-        if spec.check_seed and not pooled and episodes > envs.num_envs:
-            _check_starts_again(envs, seeds[0], first, spec.name)
-        return evaluation
-    finally:
-        envs.close()
+def _fitted(policy: Policy, spaces: tuple[gym.Space[Any], gym.Space[Any]], name: str) -> Policy:
+    """Return a policy for the spaces of the environment ``name``, tried out where it is foreign."""
+    if isinstance(policy, Foreign):
+        policy = policy.bind(*spaces, "the policy")
+    check_spaces(policy, *spaces, "the policy", name)
+    if isinstance(policy, Foreign):
+        policy.try_out()
+    return policy
 
 
 def _describe(spec: EnvSpec) -> tuple[int | None, float | None, bool]:
     """Return an environment's time limit, reward threshold, and True if it is in a pool."""
-    env = spec.make()
-    try:
+    with closing(spec.make()) as env:
         threshold = env.spec.reward_threshold if env.spec else None
         return time_limit(env), threshold, in_pool(spec, env)
-    finally:
-        env.close()
 
 
 def _with_notice(moments: Iterator[Played], name: str, most: int) -> Iterator[Played]:

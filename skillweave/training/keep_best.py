@@ -24,17 +24,10 @@ class KeepBest:
 
     def __init__(self, of: Literal["return", "success"], wanted: bool = True) -> None:
         self.of, self.wanted = of, wanted
-        self.steps = 0
-        """Environment steps of the stage at this evaluation."""
-        self.metrics: dict[str, float] = {}
-        """Metrics of this evaluation; empty: none yet."""
+        self.found: BestSoFar | None = None
+        """The steps of the stage at this evaluation, and its metrics; None: none yet."""
         self.states: dict[str, Any] = {}
         """Whole states of the learners, by name, on the CPU."""
-
-    @property
-    def value(self) -> float:
-        """The best evaluation's value of the criterion."""
-        return self.metrics[f"eval_{self.of}"]
 
     def see(
         self, evaluation: Mapping[str, float], steps: int, states: Callable[[], dict[str, Any]]
@@ -49,19 +42,14 @@ class KeepBest:
         value = evaluation.get(f"eval_{self.of}", math.nan)
         if not self.wanted or math.isnan(value):  # or no evaluation, or no episode could start
             return
-        if self.metrics and self._rank(evaluation) < self._rank(self.metrics):
+        if self.found and self._rank(evaluation) < self._rank(self.found.metrics):
             return
-        self.steps = steps
-        self.metrics = dict(evaluation)
+        self.found = BestSoFar(steps, dict(evaluation))
         # Learners change their tensors in place.
         self.states = {name: _copied(state) for name, state in states().items()}
 
     def _rank(self, metrics: Mapping[str, float]) -> tuple[float, float]:
         return metrics[f"eval_{self.of}"], metrics["eval_return"]
-
-    def header(self) -> BestSoFar | None:
-        """Return the entry for the header of a checkpoint."""
-        return BestSoFar(self.steps, self.metrics) if self.metrics else None
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors for a checkpoint."""
@@ -72,7 +60,7 @@ class KeepBest:
 
     def load(
         self,
-        best: BestSoFar | None,
+        found: BestSoFar | None,
         extra: Mapping[str, Tensor],
         like: Mapping[str, Any],
         where: str,
@@ -80,15 +68,14 @@ class KeepBest:
         """Restore the best evaluation from a checkpoint.
 
         Args:
-            best: of the checkpoint's header.
+            found: of the checkpoint's header.
             extra: its tensors beside the state.
             like: states of the learners' shapes, by name.
             where: the run, for messages.
         """
-        if best is None:
+        self.found = found
+        if found is None:
             return
-        self.steps = best.steps
-        self.metrics = best.metrics
         saved = unprefixed("best", dict(extra))
         self.states = {
             name: state_from(unprefixed(name, saved), example, f"{where}: the best of {name}")

@@ -179,9 +179,9 @@ def acting_of(stack: Stack, saved: dict[str, Tensor]) -> ActingParams:
     return params
 
 
-def keep_to_guide(learner: Learner, target_kl: float | None) -> None:
+def keep_to_guide(learner: RolloutLearner, target_kl: float | None) -> None:
     """Keep the selector within ``target_kl`` of its guide; None disables this."""
-    if target_kl is not None and isinstance(learner, RolloutLearner):
+    if target_kl is not None:
         (stack,) = learner.stacks
         coef = torch.ones_like(stack.state.params[:, 0])
         learner.reference = Reference(None, coef, target_kl)

@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -102,140 +101,124 @@ class Progress:
 
 @dataclass
 class Saved:
-    """Content of a checkpoint."""
+    """Content of a checkpoint, beside the states of the stacks."""
 
     at: Progress
-    states: list[Any]  # of each stack
     extra: dict[str, Tensor]  # environments, replay, and the rows that are requested
 
 
-OnTick = Callable[[Tick], None]
-OnCheckpoint = Callable[[Saved], None]
-OnCalls = Callable[[Batch], None]
+@dataclass
+class Loop:
+    """One stage's training; states of the learner change."""
 
+    learner: Learner
+    collectors: Collectors
+    """Fresh or already started."""
+    episodes: Episodes
+    """The latest episodes, for the metrics; new ones are added."""
+    seeds: Seeds
+    budget: int
+    """Environment steps."""
+    at: Progress = field(default_factory=Progress)
+    """The counts so far."""
+    schedule_steps: int | None = None
+    """The part of the budget at which schedules end; None: all of it."""
+    skip_diverged: bool = False
+    """Continue where a member diverges."""
+    checkpoint_every: int = 250_000
+    """Environment steps between checkpoints. They are also written by time
+    (``CHECKPOINT_SECONDS``), and on an interrupt."""
+    on_tick: Callable[[Tick], None] | None = None
+    """Called with each report; may raise to stop."""
+    on_checkpoint: Callable[[Saved], None] | None = None
+    """Writes a checkpoint; None: the loop writes none, and ignores interrupts."""
+    on_calls: Callable[[Batch], None] | None = None
+    """Records the calls in new steps, where collectors return them."""
 
-def train(
-    learner: Learner,
-    collectors: Collectors,
-    episodes: Episodes,
-    seeds: Seeds,
-    budget: int,
-    *,
-    counts: Literal["steps", "updates"] = "steps",
-    resume_from: Progress | None = None,
-    schedule_steps: int | None = None,
-    skip_diverged: bool = False,
-    checkpoint_every: int = 250_000,
-    on_tick: OnTick | None = None,
-    on_checkpoint: OnCheckpoint | None = None,
-    on_calls: OnCalls | None = None,
-) -> Progress:
-    """Train until the ``budget`` is spent; states of the learner change.
+    def restore(self, saved: dict[str, Tensor]) -> Array:
+        """Continue from a checkpoint, or in new episodes from the final state of a stage.
 
-    Args:
-        collectors: fresh or already started.
-        episodes: the latest episodes, for the metrics; new ones are added.
-        budget: environment steps, or updates.
-        counts: unit of the budget; a source that makes no steps needs updates.
-        schedule_steps: the part of the budget at which schedules end; None: all of it.
-        skip_diverged: continue where a member diverges.
-        checkpoint_every: environment steps between checkpoints. They are also written by time
-            (``CHECKPOINT_SECONDS``), and on an interrupt.
-        on_tick: called with each report; may raise to stop.
-        on_checkpoint: writes a checkpoint; None: the loop writes none, and ignores interrupts.
-        on_calls: records the calls in new steps, where collectors return them.
+        Args:
+            saved: the ``extra`` of one of these; the steps in ``at`` are those at that time.
 
-    Returns:
-        Counts at the end of training.
+        Returns:
+            (k,) environments that start new episodes, as they did not repeat theirs exactly.
+        """
+        arrays = {k: v.numpy() for k, v in unprefixed("collector", saved).items()}
+        of_learner = unprefixed("learner", saved)
+        if not arrays:
+            self.at.reported = self.at.steps
+            if of_learner:
+                self.learner.load(of_learner)
+                self.learner.cut(np.arange(self.collectors.num_envs))
+            self.collectors.start(self.seeds / "continued" / self.at.steps)
+            return np.empty(0, np.int64)
+        self.at.load(unprefixed("loop", saved))
+        self.episodes.load(unprefixed("episodes", arrays))
+        restarted = self.collectors.restore(arrays)
+        self.learner.load(of_learner)
+        self.learner.cut(restarted)
+        return restarted
 
-    Raises:
-        TrainingError: parameters or losses are no longer finite.
-        KeyboardInterrupt: after an interrupt, when a checkpoint is written.
-    """
-    loop = _Loop(learner, collectors, episodes, seeds, resume_from or Progress(), on_tick)
-    loop.schedule_steps, loop.counts = schedule_steps or budget, counts
-    loop.skip_diverged = skip_diverged
-    loop.checkpoint_every = checkpoint_every
-    loop.on_checkpoint, loop.on_calls = on_checkpoint, on_calls
-    with torch_threads(1 if learner.overlap else learner.threads):
-        try:
-            collectors.start(seeds / "start")
-            loop.request()
-            while loop.spent < budget:
-                loop.round(budget)
-            loop.report()
-        finally:
-            loop.close()
-    return loop.at
+    def run(self) -> Progress:
+        """Train until the ``budget`` is spent; return the counts at the end.
 
-
-class _Loop:
-    """One stage's training."""
-
-    schedule_steps: int
-    counts: Literal["steps", "updates"]
-    skip_diverged: bool
-    checkpoint_every: int
-    on_checkpoint: OnCheckpoint | None
-    on_calls: OnCalls | None
-
-    def __init__(
-        self,
-        learner: Learner,
-        collectors: Collectors,
-        episodes: Episodes,
-        seeds: Seeds,
-        at: Progress,
-        on_tick: OnTick | None,
-    ) -> None:
-        self.learner = learner
-        self.collectors = collectors
-        self.episodes = episodes
-        self.seeds = seeds
-        self.at = at
-        self._on_tick = on_tick
-        self._started = time.perf_counter() - at.seconds
+        Raises:
+            TrainingError: parameters or losses are no longer finite.
+            KeyboardInterrupt: after an interrupt, when a checkpoint is written.
+        """
+        learner = self.learner
+        self._saved_at, self._saving_took = time.perf_counter(), 0.0
+        self._started = self._saved_at - self.at.seconds
         self._thread = WorkThread("learner", learner.threads)
         self._pending: Future[dict[str, Tensor]] | None = None
-        self._saved_at = time.perf_counter()
-        self._saving_took = 0.0
+        with torch_threads(1 if learner.overlap else learner.threads):
+            try:
+                self.collectors.start(self.seeds / "start")
+                self._request()
+                while self.at.steps < self.budget:
+                    self._round()
+                self._report()
+            finally:
+                self._thread.close()  # after a pending update, as it changes states in place
+        return self.at
 
-    def round(self, budget: int) -> None:
+    def _round(self) -> None:
         """Collect once, and learn from the result, or start to."""
         at, learner = self.at, self.learner
-        collected = self.collectors.collect(self._request)
+        collected = self.collectors.collect(self._requested)
         if self.on_calls is not None and collected.calls is not None:
             self.on_calls(collected.calls)
-        self.report()
-        before, steps, update = self.spent, at.steps, at.update
+        self._report()
+        before, update = at.steps, at.update
         at.steps += collected.steps
         at.update += 1
-        over = self.spent >= budget
+        over = at.steps >= self.budget
         self.episodes.extend(collected.episodes, collected.info_keys, collected.longest)
         if len(collected.begun_anew):
             learner.cut(collected.begun_anew)
         learner.take(collected.batches)
         if learner.overlap and not over:
-            self.request()  # before the parameters change
+            self._request()  # before the parameters change
         every = learner.report_every
-        self._start_update(update, not every or over or crossed(every, before, self.spent))
+        self._start_update(update, not every or over or crossed(every, before, at.steps))
         if not learner.overlap:
-            self.report()
+            self._report()
             if not over:
-                self.request()
+                self._request()
         if not over:
-            self._save_if_due(steps)
+            self._save_if_due(before)
 
-    def request(self) -> None:
+    def _request(self) -> None:
         """Prepare the next request with the present parameters."""
         at = self.at
-        self._request = self.learner.request(at.update, at.steps, self._progress())
+        self._requested = self.learner.request(at.update, at.steps, self._progress())
 
     def _start_update(self, update: int, due: bool) -> None:
         """Learn, on the thread if the learner overlaps; write a report later if it is due."""
         arguments = update, self.at.steps, self._progress()
         # The means of episodes are of this moment, whatever the length of the update.
-        summary = self.episodes.summary() if due and self._on_tick is not None else {}
+        summary = self.episodes.summary() if due and self.on_tick is not None else {}
         self.at.report = Report(update + 1, self.at.steps, due, summary)
         if self.learner.overlap:
             self._pending = self._thread.submit(self.learner.learn, *arguments)
@@ -244,12 +227,11 @@ class _Loop:
 
     def _finish_update(self) -> None:
         """Finish a pending update: wait for it, and keep its metrics."""
-        if self._pending is not None:
-            metrics = self._pending.result()
+        if (pending := self._pending) is not None:
             self._pending = None
-            self.at.metrics |= metrics
+            self.at.metrics |= pending.result()
 
-    def report(self) -> None:
+    def _report(self) -> None:
         """Finish a pending update, and write its report."""
         self._finish_update()
         report = self.at.report
@@ -261,22 +243,12 @@ class _Loop:
         since = self.at.reported
         self.at.reported = report.steps
         self.at.metrics = {}
-        if self._on_tick is not None:
-            state = [stack.state for stack in self.learner.stacks]
+        if self.on_tick is not None:
             metrics |= report.summary
-            self._on_tick(Tick(report.update, report.steps, since, self.at.seconds, metrics, state))
-
-    def close(self) -> None:
-        """Stop after a pending update, as it changes states in place."""
-        self._thread.close()
-
-    @property
-    def spent(self) -> int:
-        """The part of the budget that is spent."""
-        return self.at.update if self.counts == "updates" else self.at.steps
+            self.on_tick(Tick(report.update, report.steps, since, self.at.seconds, metrics))
 
     def _progress(self) -> float:
-        return min(1.0, self.spent / self.schedule_steps)
+        return min(1.0, self.at.steps / (self.schedule_steps or self.budget))
 
     def _take_time(self) -> None:
         self.at.seconds = time.perf_counter() - self._started
@@ -312,52 +284,6 @@ class _Loop:
         tensors = {k: to_tensor(np.array(v)) for k, v in arrays.items()}
         extra = prefixed("collector", tensors) | prefixed("learner", self.learner.kept())
         self._take_time()
-        states = [stack.state for stack in self.learner.stacks]
-        self.on_checkpoint(Saved(self.at, states, extra | prefixed("loop", self.at.state())))
+        self.on_checkpoint(Saved(self.at, extra | prefixed("loop", self.at.state())))
         self._saved_at = time.perf_counter()
         self._saving_took = self._saved_at - since
-
-
-def resume(
-    learner: Learner,
-    collectors: Collectors,
-    episodes: Episodes,
-    saved: dict[str, Tensor],
-    at: Progress,
-) -> Array:
-    """Restore the state of a checkpoint; return environments (k,) that start new episodes.
-
-    These environments did not repeat their episodes exactly.
-
-    Args:
-        saved: the checkpoint's ``extra``.
-        at: its steps; the pending report is added.
-    """
-    arrays = {k: v.numpy() for k, v in unprefixed("collector", saved).items()}
-    at.load(unprefixed("loop", saved))
-    episodes.load(unprefixed("episodes", arrays))
-    restarted = collectors.restore(arrays)
-    learner.load(unprefixed("learner", saved))
-    learner.cut(restarted)
-    return restarted
-
-
-def begin_episodes(
-    learner: Learner,
-    collectors: Collectors,
-    saved: dict[str, Tensor],
-    at: Progress,
-    seeds: Seeds,
-) -> None:
-    """Continue a finished stage in new episodes.
-
-    Args:
-        saved: the ``extra`` of its final state.
-        at: its steps.
-        seeds: of the stage; the new episodes differ from those at its start.
-    """
-    at.reported = at.steps
-    if learner_state := unprefixed("learner", saved):
-        learner.load(learner_state)
-        learner.cut(np.arange(collectors.num_envs))
-    collectors.start(seeds / "continued" / at.steps)

@@ -16,6 +16,7 @@ from skillweave.envs.infos import allowed_rows
 from skillweave.errors import SkillweaveError, reworded
 from skillweave.experience.acting import Acting, Request
 from skillweave.experience.collector import RETURN, SUCCESS, Collector
+from skillweave.experience.learners import Alone, Calling
 from skillweave.ops.threads import torch_threads
 from skillweave.training.learner import crossed
 from skillweave.training.learning_task import LearningTask
@@ -50,12 +51,12 @@ class PeriodicEvaluation:
         """Seconds of the latest evaluation."""
         self.after = 0.0
         """Seconds of the training before it."""
-        self._arena: Collector | None = None
+        self._engine: Engine | None = None
         if every is None:
             return
         num_envs = min(episodes, num_envs)
         try:
-            self._arena = learning_task.collector(num_envs, None)
+            self._engine = learning_task.engine(num_envs)
         except SkillweaveError as error:
             raise reworded(
                 error,
@@ -68,7 +69,7 @@ class PeriodicEvaluation:
         self,
         since: int,
         steps: int,
-        play: Callable[[Collector, Seeds], Array],
+        play: Callable[[Engine, Seeds], Array],
         *,
         also: bool = False,
     ) -> dict[str, float]:
@@ -83,11 +84,11 @@ class PeriodicEvaluation:
         """
         if self._every is None or not (also or crossed(self._every, since, steps)):
             return {}
-        assert self._arena is not None
+        assert self._engine is not None
         started = time.monotonic()
-        rounds = -(-self._episodes // self._arena.num_envs)
+        rounds = -(-self._episodes // self._engine.num_envs)
         seeds = [self._seeds, *(self._seeds / "round" / i for i in range(1, rounds))]
-        played = [play(self._arena, each) for each in seeds]  # (n, 4 + I) each
+        played = [play(self._engine, each) for each in seeds]  # (n, 4 + I) each
         episodes = np.concatenate(played)[: self._episodes]
         self.after = started - self._ended
         self._ended = time.monotonic()
@@ -100,20 +101,21 @@ class PeriodicEvaluation:
 
     def spent(self) -> int:
         """Return the environment steps since the previous call."""
-        made = 0 if self._arena is None else self._arena.engine.steps_made
+        made = 0 if self._engine is None else self._engine.steps_made
         since = made - self._counted
         self._counted = made
         return since
 
     def close(self) -> None:
         """Release the environments."""
-        if self._arena is not None:
-            self._arena.close()
+        if self._engine is not None:
+            self._engine.close()
 
 
 def episodes_of(
     policy: AgentPolicy,
-    eval_envs: Collector,
+    who: Alone | Calling,
+    engine: Engine,
     seeds: Seeds,
     first: int = 0,
     count: int | None = None,
@@ -121,21 +123,22 @@ def episodes_of(
     """Play one greedy episode in each environment; return rows like ``Collected.episodes``.
 
     Args:
+        who: acts, by this policy.
         first: the number of the first episode. An episode's start depends on its number alone, so
             several rounds in few environments have the same starts as one round in many.
-        count: the number of environments, the first of ``eval_envs``; None: all.
+        count: the number of environments, the first of ``engine``; None: all.
 
     Returns:
         (n, 4), n at least 1; environments in which a skill could never start are left out.
     """
-    algorithm, engine = policy.algorithm, eval_envs.engine
-    if first or count not in (None, eval_envs.num_envs):
-        engine = cast(Engine, _Round(engine, first, count or eval_envs.num_envs))
+    algorithm = policy.algorithm
+    if first or count not in (None, engine.num_envs):
+        engine = cast(Engine, _Round(engine, first, count or engine.num_envs))
     # Each round has its own random streams.
     acting_seeds, global_seeds = (
         seeds / k / first if first else seeds / k for k in ("act", "global")
     )
-    player = eval_envs.like(engine, Acting([(algorithm, 1)], engine.num_envs))
+    player = Collector(engine, Acting([(algorithm, 1)], engine.num_envs), who)
     params = algorithm.acting_params_of(policy.weights)
     gamma = np.array([algorithm.config.gamma])
     request = Request(0, (params,), gamma, acting_seeds, greedy=True)

@@ -30,7 +30,7 @@ from skillweave.runs.files import (
 )
 from skillweave.runs.manifest import StageEntry
 from skillweave.spaces import to_tensor
-from skillweave.training.learner import Learner, RolloutLearner
+from skillweave.training.learner import RolloutLearner
 from skillweave.types import Array
 
 MOST_BYTES = 2**26
@@ -66,14 +66,14 @@ def save_rehearsal(run: RunDirectory, stage: str, obs: Array) -> None:
     repair.rehearsal = sha256
 
 
-def rehearse(learner: Learner, run: RunDirectory, entry: StageEntry, policy: Any) -> None:
+def rehearse(learner: RolloutLearner, run: RunDirectory, entry: StageEntry, policy: Any) -> None:
     """Let a learner keep what ``policy`` does in the observations of its stage's rehearsal, if any.
 
     Raises:
         RunError: the file is missing, damaged, or belongs to another run.
     """
     recorded = None if entry.repair is None else entry.repair.rehearsal
-    if recorded is None or not isinstance(learner, RolloutLearner):
+    if recorded is None:
         return
     assert isinstance(policy, AgentPolicy)
     path = _path(run, entry.name)

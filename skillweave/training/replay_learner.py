@@ -17,13 +17,7 @@ from skillweave.buffers.replay import ReplayStore
 from skillweave.experience.acting import ActionRepeat, Request
 from skillweave.ops.device import resolve_device
 from skillweave.spaces import to_tensor
-from skillweave.training.learner import (
-    Learner,
-    RolloutLearner,
-    Stack,
-    acting_of,
-    member_seeds,
-)
+from skillweave.training.learner import RolloutLearner, Stack, acting_of, member_seeds
 from skillweave.types import Array, prefixed, unprefixed
 
 DRAWN_AT_ONCE = 8
@@ -75,10 +69,6 @@ class ReplayLearner:
     def act_from_the_start(self) -> None:
         """Skip the phase of random actions: the policy is trained already."""
         self._acts_at_random = False
-
-    def learn_from_the_start(self) -> None:
-        """Learn from the first rows on, as these are recorded, and need not be explored for."""
-        self._acts_at_random, self._learns_from = False, -1
 
     def request(self, update: int, steps: int, progress: float) -> Request:
         """Return a request for ``train_freq`` rows of every environment."""
@@ -282,17 +272,26 @@ def store_of(
 
 
 def learner_of(
-    stack: Stack, num_envs: int, seeds: Seeds, *, row_steps: int = 1, goes_on_at: int = 0
-) -> Learner:
+    stack: Stack,
+    num_envs: int,
+    seeds: Seeds,
+    quota: int | None = None,
+    *,
+    row_steps: int = 1,
+    goes_on_at: int = 0,
+) -> RolloutLearner | ReplayLearner:
     """Return the learner of one stack: from rollouts or from replay, by its algorithm.
 
     Args:
+        quota: see ``RolloutLearner``; None: half of a rollout, where a row is a step.
         row_steps, goes_on_at: see ``ReplayLearner``.
     """
     if stack.algorithm.store == "rollout":
-        # A skill that can seldom start waits until a batch is large enough.
-        full = int(stack.algorithm.config.n_steps) * num_envs // stack.members
-        return RolloutLearner(stack, seeds, full // 2 if row_steps == 1 else 0)
+        if quota is None:
+            # A skill that can seldom start waits until a batch is large enough.
+            full = int(stack.algorithm.config.n_steps) * num_envs // stack.members
+            quota = full // 2 if row_steps == 1 else 0
+        return RolloutLearner(stack, seeds, quota)
     store = store_of(stack.algorithm, num_envs, stack.members)
     return ReplayLearner([stack], store, seeds, row_steps=row_steps, goes_on_at=goes_on_at)
 

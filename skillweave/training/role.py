@@ -82,6 +82,11 @@ class Role:
             return choice_space(self.choices, self.chosen_goals, self.skills)
         return self.spec.spaces.action if self.part is None else self.part.action_space
 
+    @property
+    def spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
+        """The spaces of its observations and of its actions."""
+        return self.observation_space, self.action_space
+
     @cached_property
     def part(self) -> OwnPart | None:
         """A skill's own part of observations and actions; None: it has all.

@@ -264,7 +264,7 @@ def check_replay(entry: StageEntry, role: Role) -> None:
         entry: the manifest's.
     """
     config = config_from_json(entry.algorithm)
-    algorithm = make_algorithm(config, role.observation_space, role.action_space)
+    algorithm = make_algorithm(config, *role.spaces)
     if algorithm.store != "replay":
         return
     members = entry.members

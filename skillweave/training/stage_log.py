@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from torch import Tensor
 
@@ -16,12 +16,11 @@ from skillweave.policies.files import shown
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import LINES, RunDirectory
 from skillweave.runs.initial_policies import remove_initial_policies
-from skillweave.runs.manifest import Best, Checkpoint, Reached, StageEntry, Stopped
+from skillweave.runs.manifest import Best, BestSoFar, Checkpoint, Reached, StageEntry, Stopped
 from skillweave.runs.states import drop_states, learns_again, save_state
 from skillweave.runs.trackers import Listener
 from skillweave.training.callback import TrainCallback
 from skillweave.training.episodes import EpisodeTally
-from skillweave.training.keep_best import KeepBest
 from skillweave.training.rehearsal import remove_rehearsal
 
 ENOUGH = 20
@@ -33,12 +32,12 @@ LARGEST_SPARE = 100 * 2**20
 """Most bytes of replay buffers that a finished stage keeps; without them it fills new ones."""
 
 
-def success_rate(entry: StageEntry | None) -> float:
+def success_rate(entry: StageEntry) -> float:
     """Return the share of a skill's calls that succeeded at the end of its stage.
 
-    1 for skills without ``success``, for populations, and without a stage.
+    1 for skills without ``success``, and for populations.
     """
-    if entry is None or entry.succeeded is None:
+    if entry.succeeded is None:
         return 1.0
     return max(entry.final.get(k) or 0.0 for k in ("success", "eval_success"))
 
@@ -114,27 +113,38 @@ class StageLog:
             "steps"
         )
 
-    def save(self, state: Any | None, extra: Mapping[str, Tensor] | None) -> None:
-        """Write a checkpoint: a state, and other tensors for resuming.
+    def save(self, tensors: Mapping[str, Tensor]) -> None:
+        """Write a checkpoint.
 
         The updates and steps of ``at`` must be of this moment; its metrics are the latest reported
         ones.
         """
-        self.run.save_checkpoint(state, self.at, extra)
+        self.run.save_checkpoint(None, self.at, tensors)
         self._notify_callbacks()
 
     def _notify_callbacks(self) -> None:
         for callback in self._callbacks:
             callback.checkpoint(self.entry.name, self.at.steps, self.at.metrics)
 
-    def report_absent(self, tally: EpisodeTally, *, over: bool) -> None:
-        """Report once in a run the logged keys of ``info`` that never occurred.
+    def report_episodes(self, tally: EpisodeTally, *, over: bool) -> None:
+        """Report once in a run logged keys of ``info`` that never occurred, and endless episodes.
 
         Args:
             over: the stage has ended, so no more episodes will come.
         """
-        if not tally.absent or not tally.ended or (tally.ended < ENOUGH and not over):
-            return
+        if tally.ended >= (1 if over else ENOUGH):
+            self._report_absent(tally)
+        if tally.longest >= LONG_EPISODE:
+            notice(
+                f"an episode has run {LONG_EPISODE:,} steps without an end, and no time limit is "
+                f"known: it is truncated only after {LONGEST_EPISODE:,} steps, and evaluations cut "
+                f"theirs after {LONG_EPISODE:,}. If it should end sooner, or be evaluated for "
+                "longer, give the environment a limit: EnvSpec(..., "
+                "wrappers=(lambda env: gymnasium.wrappers.TimeLimit(env, 1000),))"
+            )
+
+    def _report_absent(self, tally: EpisodeTally) -> None:
+        """Report the logged keys of ``info`` that never occurred."""
         absent = [key for key in tally.absent if key not in self.run.reported_absent]
         self.run.reported_absent |= set(absent)
         others = sorted(tally.others - set(absent))
@@ -143,18 +153,6 @@ class StageLog:
                 f"none of {tally.ended} episodes ended with a number in info[{key!r}] (log_info)"
                 f"{suggest(key, others) or '; it was empty there'}"
             )
-
-    def report_endless(self, tally: EpisodeTally) -> None:
-        """Report once in a run that an episode has gone on for ``LONG_EPISODE`` steps."""
-        if tally.longest < LONG_EPISODE:
-            return
-        notice(
-            f"an episode has run {LONG_EPISODE:,} steps without an end, and no time limit is "
-            "known: it is truncated only after "
-            f"{LONGEST_EPISODE:,} steps, and evaluations cut theirs after {LONG_EPISODE:,}. If it "
-            "should end sooner, or be evaluated for longer, give the environment a limit: "
-            "EnvSpec(..., wrappers=(lambda env: gymnasium.wrappers.TimeLimit(env, 1000),))"
-        )
 
     def tell_slow(self, took: float, after: float) -> None:
         """Report once in a run that evaluations take longer than training.
@@ -178,26 +176,21 @@ class StageLog:
             f"the callback returned False after {self.at.steps:,} steps: the stage ends here"
         )
 
-    def kept_best(self, best: KeepBest) -> None:
-        """Record that the stage ends with the weights of its best evaluation."""
-        self.entry.best = Best(best.steps, best.of, best.value)
+    def kept_best(self, best: BestSoFar, of: Literal["return", "success"]) -> None:
+        """Record that the stage ends with the weights of its best evaluation, by this criterion."""
+        self.entry.best = Best(best.steps, of, best.metrics[f"eval_{of}"])
         self.at.metrics = self.at.metrics | best.metrics
         self.message(str(self.entry.best))
 
     def save_final(
-        self,
-        state: Any | None,
-        extra: Mapping[str, Tensor],
-        spare: Mapping[str, Tensor],
-        *,
-        spent: bool,
+        self, needed: Mapping[str, Tensor], spare: Mapping[str, Tensor], *, spent: bool
     ) -> None:
         """Write the state from which the stage could continue for more steps.
 
         A full disk does not stop the stage: its policies are smaller.
 
         Args:
-            extra: tensors that continuing needs beside the state.
+            needed: tensors that continuing needs.
             spare: replay buffers, which are left out if they are large.
             spent: the budget is spent, so the state is a checkpoint, too, in case writing the
                 policies fails. Else a run that is killed now repeats the end of the stage from
@@ -205,9 +198,9 @@ class StageLog:
         """
         write = self.run.save_checkpoint if spent else self.run.save_final
         small = sum(x.numel() * x.element_size() for x in spare.values()) <= LARGEST_SPARE
-        for tensors in ({**extra, **spare}, extra) if spare and small else (extra,):
+        for tensors in ({**needed, **spare}, needed) if spare and small else (needed,):
             try:
-                write(state, self.at, tensors)
+                write(None, self.at, tensors)
             except RunError as error:
                 problem = error
             else:

@@ -141,7 +141,7 @@ def test_one_part_is_the_population_itself(network):
             until = population.steps // 5 + 40
             population.train(until, 200, seeds / generation, partial(_add, ticks))
             found.append(population.fitness(eval_envs, seeds / "fitness" / generation))
-            population.state()
+            population.part.state()
             population.evolve(found[-1], seeds / "evolve" / generation)
         np.testing.assert_array_equal(*found)
         assert told[0] == told[1]
@@ -153,8 +153,8 @@ def test_one_part_is_the_population_itself(network):
                 assert torch.equal(getattr(ours.state, name), value)
     assert parts.steps_elsewhere == eval_envs.steps_made == 3 * 5 * 2 * 7
     eval_envs.close()
-    split.close()
-    plain.close()
+    split.part.close()
+    plain.part.close()
 
 
 def _add(ticks: list[Any], steps: int, metrics: dict[str, float]) -> None:

@@ -39,7 +39,7 @@ from skillweave.evolution import (
     stage as evolving,
 )
 from skillweave.evolution.fitness import FitnessEnvs
-from skillweave.evolution.part import has_diverged
+from skillweave.evolution.part import Part, has_diverged
 from skillweave.evolution.population import Population
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors, write_tensors
@@ -216,15 +216,15 @@ def test_a_killed_population_of_selectors_ends_with_the_very_same_weights(
     )
     evolve = {"selector": Evolution(3, 4, 2, mutations=EVERYTHING)}
     whole = hierarchy.train(tmp_path / "whole", quiet=True, evolve=evolve)
-    state, cuts = Population.state, [0]
+    state, cuts = Part.state, [0]
 
-    def dies(self: Population) -> Any:
+    def dies(self: Part) -> Any:
         cuts[0] += 1
         if cuts[0] == 3:  # goes on from the second
             raise KeyboardInterrupt
         return state(self)
 
-    monkeypatch.setattr(Population, "state", dies)
+    monkeypatch.setattr(Part, "state", dies)
     with pytest.raises(KeyboardInterrupt):
         hierarchy.train(tmp_path / "run", quiet=True, evolve=evolve)
     monkeypatch.undo()
@@ -389,7 +389,7 @@ def test_members_go_on_with_the_open_episodes_of_their_places(name):
         population.evolve(np.arange(3.0), Seeds(2) / generation)
     rows = CONFIGS[name].n_steps if name == "ppo" else 3
     assert ages == [rows * (g + 1) % 10 for g in range(4)]
-    population.close()
+    population.part.close()
 
 
 @pytest.mark.parametrize("name", ["ppo", "dqn"])
@@ -406,7 +406,7 @@ def test_the_steps_of_members_are_those_that_their_environments_made(name):
         assert population.steps - were == made == told[-1]
         assert made >= 3 * 50 - 3 * 32
         population.evolve(np.arange(3.0), Seeds(2) / generation)
-    population.close()
+    population.part.close()
 
 
 def test_it_ends_early_at_the_target(tmp_path):

@@ -189,8 +189,8 @@ def test_the_best_is_in_the_checkpoint_once(
     assert header["kept_best"]["steps"] == best
     assert header["kept_best"]["metrics"]["eval_return"] == found[best]
     size = sum(v.nbytes for k, v in tensors.items() if k.startswith("extra.best."))
-    state = sum(v.nbytes for k, v in tensors.items() if not k.startswith("extra."))
-    assert size == state
+    state = sum(v.nbytes for k, v in tensors.items() if k.startswith("extra.state."))
+    assert size == state > 0
     assert not list((tmp_path / "run").glob("*best*"))
 
 
@@ -240,7 +240,8 @@ def ranked(of: Any, *found: tuple[float, float]) -> int:
     for steps, (value, success) in enumerate(found, 1):
         best.see({"eval_return": value, "eval_success": success}, steps, lambda: {"a": state})
         best.see({}, 99, dict)
-    return best.steps
+    assert best.found is not None
+    return best.found.steps
 
 
 def test_of_equal_evaluations_the_latest_is_best() -> None:

@@ -32,7 +32,7 @@ from skillweave.experience.group import Collectors
 from skillweave.networks.config import Network
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack, crossed
-from skillweave.training.loop import Progress, Saved, train
+from skillweave.training.loop import Loop, Progress, Saved
 from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.types import unprefixed
 
@@ -225,7 +225,7 @@ def test_where_environments_begin_anew_trajectories_and_returns_end():
     found.learner.cut(np.array([1, 3]))
     assert found.learner.counts()["returns"].tolist() == [1.5, 0.0, 1.5, 0.0]
     found.collectors.parts[0]._begin_anew(np.array([1, 3]))
-    found.run(4 * 4, resume_from=Progress(2, 8))
+    found.run(4 * 4, at=Progress(2, 8))
     drawn = found.learner.store.sample(500, found.state.gamma, [np.random.default_rng(0)])
     after = {(int(o), int(n)) for o, n in zip(drawn.obs[0], drawn.next_obs[0], strict=True)}
     assert after == {(0, 2), (1, 3), (2, 4), (3, 4), (1, 2)}
@@ -261,7 +261,7 @@ def test_a_resumed_run_without_its_store_fills_it_by_what_it_has_learnt():
     env = Identity(4)
     spy = Spy(replace(CONFIG, save_buffer=False), env.observation_space, env.action_space)
     found = training(spy, env, goes_on_at=200)
-    found.run(400, resume_from=Progress(50, 200))
+    found.run(400, at=Progress(50, 200))
     assert "random" not in spy.log
     assert spy.log[:11] == ["act"] * 11  # until there are more than 40 transitions again
     assert spy.log[11:16] == ["learn"] * 4 + ["act"]
@@ -356,7 +356,7 @@ def test_stacks_side_by_side_share_one_store_and_each_has_its_rows_by_its_own_ra
     store = store_of(spies[0], 12, 3, shared=True)
     learner = ReplayLearner(stacks, store, Seeds(0))
     collector = env.collector(Acting([(s.algorithm, s.members) for s in stacks], 12))
-    train(learner, Collectors([collector], 3), Episodes(), Seeds(0), 300)
+    Loop(learner, Collectors([collector], 3), Episodes(), Seeds(0), 300).run()
     # 100 steps of each member, 40 of them at random.
     assert [s.log.count("learn") for s in spies] == [60, 30]
     assert [s.samples[0].reward.shape[0] for s in spies] == [1, 2]

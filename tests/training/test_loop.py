@@ -266,7 +266,7 @@ def test_training_ends_within_one_rollout_of_its_budget(config, env, budget):
 def test_a_budget_that_is_spent_already_changes_nothing():
     found = made(Identity(16))
     before = found.state.params.clone()
-    assert found.run(256, resume_from=Progress(1, 256)) == Progress(1, 256)
+    assert found.run(256, at=Progress(1, 256)) == Progress(1, 256)
     assert torch.equal(found.state.params, before)
 
 
@@ -351,7 +351,7 @@ SMALL = {
 def test_environments_in_processes_teach_the_same_as_in_this_one_though_workers_die(name):
     config = SMALL[name]
     learning_task = skill_task(agent_role(EnvSpec("CartPole-v1", engine="sync")))
-    algorithm = make_algorithm(config, learning_task.observation_space, learning_task.action_space)
+    algorithm = make_algorithm(config, *learning_task.role.spaces)
 
     def collector(num_envs: int, first: int):
         return learning_task.collector(num_envs, Acting([(algorithm, 1)], num_envs), first)

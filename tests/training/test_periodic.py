@@ -24,6 +24,7 @@ from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.envs import checks
 from skillweave.experience.collector import RETURN
+from skillweave.experience.learners import Alone
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.training.periodic import PeriodicEvaluation, episodes_of
@@ -38,7 +39,8 @@ def fresh(env: Toy) -> AgentPolicy:
 
 
 def played(env: Toy, seed: int = 0) -> list[float]:
-    return episodes_of(fresh(env), env.collector(None), Seeds(seed))[:, RETURN].tolist()
+    who = env.collector(None).who
+    return episodes_of(fresh(env), who, env, Seeds(seed))[:, RETURN].tolist()
 
 
 def played_by_hand(env: Any, policy: AgentPolicy) -> list[float]:
@@ -88,11 +90,11 @@ def test_equal_seeds_give_equal_starts_and_others_other_ones():
 
 
 def test_an_evaluation_is_made_once_in_every_so_many_steps():
-    learning_task: Any = SimpleNamespace(collector=lambda n, acting: Countdown(n).collector(acting))
+    learning_task: Any = SimpleNamespace(engine=Countdown)
     policy = fresh(Countdown(1))
 
-    def play(eval_envs: Any, seeds: Seeds) -> Any:
-        return episodes_of(policy, eval_envs, seeds)
+    def play(engine: Any, seeds: Seeds) -> Any:
+        return episodes_of(policy, Alone(), engine, seeds)
 
     evaluation = PeriodicEvaluation(learning_task, Seeds(0), 100, 3, 8)
     ticks = (250, 260, 299, 300, 350, 520, 599, 601)

@@ -1,0 +1,440 @@
+"""The learners of a stage without a population: one, or a selector and skills together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skillweave._internal.paths import CRITIC, SELECTOR, decides, level_of, relative
+from skillweave._internal.seeding import Seeds, global_generators, seed_global_generators
+from skillweave.algorithms.base import Algorithm, state_to
+from skillweave.algorithms.batches import Reference
+from skillweave.algorithms.config import config_from_json
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
+from skillweave.envs.checks import longest_evaluation
+from skillweave.envs.engine import Engine
+from skillweave.errors import DeclarationError
+from skillweave.experience.acting import Acting, Request
+from skillweave.experience.collector import Collector
+from skillweave.ops.device import resolve_device
+from skillweave.ops.threads import torch_threads
+from skillweave.runs.initial_policies import initial_policy
+from skillweave.runs.manifest import StageEntry
+from skillweave.runs.states import load_state, state_path
+from skillweave.training.episodes import Episodes, Tick
+from skillweave.training.joint import JointLearner
+from skillweave.training.keep_best import KeepBest
+from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
+from skillweave.training.learning_task import LearningTask
+from skillweave.training.loop import Loop, Progress, Saved
+from skillweave.training.periodic import PeriodicEvaluation, episodes_of
+from skillweave.training.rehearsal import rehearse
+from skillweave.training.replay_learner import learner_of
+from skillweave.training.stage import Together
+from skillweave.training.stage_log import StageLog, resumed, success_rate
+from skillweave.training.stage_run import StageRun
+from skillweave.types import Array, prefixed, unprefixed
+from skillweave.workers.placement import MakeCollectors, make_collectors
+
+EARLY = 0.25
+"""Share of a stage's budget after which skills without a call are reported."""
+
+
+class Agents:
+    """The learners of a stage without a population: one, or several that learn together.
+
+    Args:
+        make_collectors: makes the collectors, here or in other processes.
+    """
+
+    def __init__(self, stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> None:
+        self.stage, self.entry, self.task = stage, stage.entry, stage.learning_task
+        entry = self.entry
+        if entry.evolution is not None:
+            raise DeclarationError(f"stage {entry.name!r} evolves: it needs a population to train")
+        first = entry.decides or entry.learns[0]
+        self.level = level_of(first)
+        self.roles = self.task.roles or {first: self.task.role}
+        self.together = None if entry.together is None else Together(**entry.together)
+        self._resources = ExitStack()
+        self._make_collectors = make_collectors
+
+    def open(self) -> None:
+        """Make the learning algorithms, and the environments."""
+        stage, task, num_envs = self.stage, self.task, self.entry.num_envs
+        manifest = stage.run.manifest
+        self.algorithms: dict[str, Algorithm] = {}
+        for name in self.entry.learns:
+            wanted = self._config(name), *self.roles[name].spaces
+            self.algorithms[name] = self._equal_algorithm(*wanted) or make_algorithm(*wanted)
+        self.earlier = {name: self._earlier_policy(name) for name in self.algorithms}
+        how = task, self._acting(), self._margins(), stage.seeds / "global"
+        self.collectors = self._make_collectors(
+            partial(_collector, *how), num_envs, self.entry.workers, 1, task.role.spec.name
+        )
+        self._resources.callback(self.collectors.close)
+        every, episodes = manifest.eval_every, manifest.eval_episodes
+        self.evaluation = PeriodicEvaluation(task, stage.seeds, every, episodes, num_envs)
+        self._resources.callback(self.evaluation.close)
+        target = self.entry.target
+        self.best = KeepBest("return" if target is None else target.of, manifest.keep == "best")
+
+    def _config(self, name: str) -> Any:
+        """Return a learner's settings, with the networks that it has grown in a population."""
+        config = config_from_json(self.entry.algorithms.get(name, self.entry.algorithm))
+        earlier = self.stage.policies.get(name)
+        if not isinstance(earlier, AgentPolicy):
+            return config
+        settings: Any = earlier.algorithm.config
+        grown = {k: getattr(settings, k) for k in ("network", "critic") if hasattr(settings, k)}
+        return replace(config, **grown)
+
+    def _equal_algorithm(self, *wanted: Any) -> Algorithm | None:
+        """Return an algorithm with equal settings and spaces: it need not be compiled again.
+
+        An algorithm holds no weights, so several learners may share one.
+        """
+        for other in self.algorithms.values():
+            if (other.config, other.observation_space, other.action_space) == wanted:
+                return other
+        return None
+
+    def _earlier_policy(self, name: str) -> tuple[AgentPolicy, int] | None:
+        """Return the earlier policy of ``name``, with the steps that it learnt from.
+
+        It is from earlier stages, or from the run that this one starts from; None: it is new.
+        """
+        stage = self.stage
+        policy = stage.policies.get(name)
+        if isinstance(policy, AgentPolicy):
+            return policy, sum(entry.steps or 0 for entry in stage.stages_before(name))
+        if self.entry.continued:
+            return None  # its final state holds everything
+        return initial_policy(stage.run, self.entry.name, name, self.algorithms[name])
+
+    def _acting(self) -> dict[str, Algorithm]:
+        """Return the acting algorithms, by their paths in the stage's level."""
+        return {relative(k, self.level): a for k, a in self.algorithms.items()}
+
+    def _margins(self) -> dict[str, float]:
+        """Return the margins of interruption, by the paths of critics in the stage's level."""
+        together = self.together
+        margins = {CRITIC: together.margin} if together and together.interrupt else {}
+        for path, role in self.roles.items():
+            if role.margin is not None and role.level != self.level:
+                margins[relative(path, self.level)] = role.margin
+        return margins
+
+    def go_on(self, extra: dict[str, Tensor], log: StageLog) -> None:
+        """Restore a checkpoint, or prepare to start where ``extra`` is empty."""
+        self.log = log
+        self.learners = {name: self._learner(name, extra) for name in self.algorithms}
+        self.joint: JointLearner | None = None
+        self.learner: Learner
+        if self.together is None:
+            (self.learner,) = self.learners.values()
+        else:
+            how = self.level, self.together.task_weight, self.entry.task_weights
+            self.learner = self.joint = JointLearner(self.learners, *how)
+        self.best.load(log.at.kept_best, extra, self.states(), str(log.run.path))
+        recorder = self.stage.recorder
+        self.loop = loop = Loop(
+            self.learner,
+            self.collectors,
+            Episodes(self.task.log_info),
+            self.stage.seeds,
+            self.entry.budget,
+            Progress(log.at.update, log.at.steps, log.at.seconds),
+            checkpoint_every=log.run.manifest.checkpoint_every,
+            on_tick=self._on_tick,
+            on_checkpoint=self._on_checkpoint,
+            on_calls=None if recorder is None else recorder.add,
+        )
+        if extra:
+            ids = resumed(log, lambda: loop.restore(extra))
+            log.report_reset(len(ids), self.collectors.num_envs)
+
+    def _learner(self, name: str, extra: dict[str, Tensor]) -> Learner:
+        """Return a learner that continues from a checkpoint or an earlier stage, or is fresh."""
+        state, algorithm = self._initial_state(name), self.algorithms[name]
+        if self.together and self.earlier[name] is not None and not extra:
+            self._report_lost_state(name)
+        device = resolve_device(algorithm.config.device)
+        reference = self._reference(name, state, device)
+        if extra:
+            saved = unprefixed(f"state.{name}", extra)
+            state = state_from(saved, state, f"{self.log.run.path}: {name}")
+        learner = learner_of(
+            Stack(algorithm, state_to(state, device)),
+            self.entry.num_envs,
+            self._seeds(name),
+            self._quota(name),
+            row_steps=self.roles[name].row_steps,
+            goes_on_at=self.log.at.steps,
+        )
+        if isinstance(learner, RolloutLearner):
+            learner.reference = reference
+            first = name == self.entry.decides
+            keep_to_guide(learner, self.entry.guide_kl if first else self.roles[name].guide_kl)
+            rehearse(learner, self.log.run, self.entry, self.stage.policies.get(name))
+        elif self.earlier[name] is not None or name in self.entry.starts:
+            learner.act_from_the_start()
+        return learner
+
+    def _seeds(self, name: str) -> Seeds:
+        return self.stage.seeds / name if self.together else self.stage.seeds
+
+    def _initial_state(self, name: str) -> Any:
+        """Return a learner's state at the start of this stage.
+
+        Where it learns on together, it is that at the end of its latest stage; else it has the
+        weights alone of its earlier policy.
+        """
+        algorithm, earlier = self.algorithms[name], self.earlier[name]
+        state = algorithm.init([self._seeds(name) / "member" / 0])
+        if earlier is None:
+            return state
+        if self.together and (kept := load_state(self.stage.run, name, state)) is not None:
+            return kept
+        policy, steps = earlier
+        algorithm.set_weights(state, policy.weights)
+        state.obs_count.fill_(max(1.0, steps))
+        return state
+
+    def _report_lost_state(self, name: str) -> None:
+        """Report a deleted file of a state."""
+        latest = self._latest_stage(name)
+        path = state_path(self.stage.run, name)
+        trained = latest is not None and latest.evolution is None and not latest.undone
+        if trained and not path.exists():
+            self.log.message(
+                f"{path} is not there any more, so {name!r} continues with its weights alone, and "
+                "learns otherwise than without the interruption"
+            )
+
+    def _reference(self, name: str, state: Any, device: torch.device) -> Reference | None:
+        """Return the reference policy of a skill that was trained before: that of ``state``."""
+        algorithm = self.algorithms[name]
+        kl = None if self.together is None else self.together.reference_kl
+        latest = self._latest_stage(name)
+        # Without a stage it starts from another run, to learn the task of this one.
+        if kl is None or decides(name) or algorithm.store != "rollout" or latest is None:
+            return None
+        if (rate := success_rate(latest)) == 0.0:
+            self.log.message(
+                f"skill {name!r} did not succeed any more when its own stage ended, so it moves "
+                "freely here (together.reference_kl is not used for it)"
+            )
+            return None
+        params = algorithm.acting_params(state, device=device)
+        # A skill that seldom succeeded has little to lose, and much to learn.
+        return Reference(params, torch.ones(1, dtype=torch.float32, device=device), kl / rate)
+
+    def _quota(self, name: str) -> int | None:
+        """Return the valid rows that a learner from rollouts waits for; None: as one alone does."""
+        together, config = self.together, self.algorithms[name].config
+        if together is None or self.algorithms[name].store != "rollout":
+            return None
+        if relative(name, self.level) in (SELECTOR, CRITIC):
+            return 0
+        steps = getattr(self.stage.config, "n_steps", None) or config.n_steps
+        rows = self.entry.num_envs * int(steps)
+        return max(1, round(rows * together.quota / self.roles[name].row_steps))
+
+    def _latest_stage(self, name: str) -> StageEntry | None:
+        """Return the latest entry of a finished stage in which ``name`` has learnt, or None."""
+        return next(reversed(self.stage.stages_before(name)), None)
+
+    def stacks(self) -> dict[str, Stack]:
+        """Return the stacks of the learners, by path."""
+        return {path: s for path, part in self.learners.items() for s in part.stacks}
+
+    def policies(self) -> dict[str, AgentPolicy]:
+        """Return the present policies of the learners, by path."""
+        return {
+            path: AgentPolicy.of(stack.algorithm, state_to(stack.state, "cpu"))
+            for path, stack in self.stacks().items()
+        }
+
+    def states(self) -> dict[str, Any]:
+        """Return the present states of the learners, by path."""
+        return {path: state_to(stack.state, "cpu") for path, stack in self.stacks().items()}
+
+    def play(self, engine: Engine, seeds: Seeds) -> Array:
+        """Play an episode in each evaluation environment, (n, 4); see ``episodes_of``."""
+        if self.together is None:
+            (policy,) = self.policies().values()
+            return episodes_of(policy, self.task.who, engine, seeds)
+        player = _acting_in(engine, self.task, self._acting(), self._margins())
+        requests = {
+            name: Request(
+                0,
+                (s.algorithm.acting_params(s.state),),
+                s.state.gamma.cpu().numpy(),
+                seeds / name,
+                greedy=self.roles[name].greedy,
+            )
+            for name, s in self.stacks().items()
+        }
+        first = str(self.entry.decides)
+        of_selector = requests.pop(first, Request(0, (), np.ones(1), seeds / first, greedy=True))
+        below = {relative(k, self.level): r for k, r in requests.items()}
+        with torch_threads(1), global_generators(seeds / "global"):
+            longest = longest_evaluation(engine.time_limit)
+            return player.play(replace(of_selector, below=below), seeds / "start", longest)
+
+    def train(self) -> dict[str, AgentPolicy]:
+        """Learn until the budget is spent or the target is reached; return the policies."""
+        log, steps, made = self.log, self.loop.at.steps, self.collectors.steps_made
+        try:
+            self.loop.run()
+        except (_TargetReached, _Stopped) as end:
+            # Count the steps collected since the update, too.
+            log.at.steps = steps + self.collectors.steps_made - made
+            if isinstance(end, _Stopped):
+                log.stopped()
+                self._save_final(spent=False)
+            else:
+                log.reached(end.args[0])
+        else:
+            self._save_final(spent=True)
+            if self.entry.kind == "skill" and self._is_unchanged():
+                log.report_learnt_nothing()
+        log.report_episodes(self.loop.episodes.tally, over=True)
+        if (best := self.best.found) is not None:
+            for path, stack in self.stacks().items():
+                stack.state = state_to(self.best.states[path], stack.state.params.device)
+            log.kept_best(best, self.best.of)
+        self._report_little_learnt()
+        return self.policies()
+
+    def _on_tick(self, tick: Tick) -> None:
+        """Evaluate where it is due, and write a report; raise at the end of the stage."""
+        log, best, budget = self.log, self.best, self.entry.budget
+        log.report_reset(self.collectors.begun_anew, self.collectors.num_envs)
+        self.collectors.begun_anew = 0
+        log.report_episodes(self.loop.episodes.tally, over=False)
+        if tick.since < EARLY * budget <= tick.steps:
+            self._report_not_called(tick.steps)
+        # If the best weights count, the last ones must be evaluated, too.
+        last = best.wanted and tick.steps >= budget
+        evaluation = self.evaluation.due(tick.since, tick.steps, self.play, also=last)
+        log.at.evaluation_steps += self.evaluation.spent()
+        if evaluation:
+            log.tell_slow(self.evaluation.took, self.evaluation.after)
+        best.see(evaluation, tick.steps, self.states)
+        log.at.kept_best = best.found
+        log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | evaluation)
+        # No checkpoint at the end: a run that resumes from the previous one comes here again.
+        target = self.entry.target
+        if target is not None:
+            value = target.reached(evaluation, self.entry.name)
+            if value is not None:
+                raise _TargetReached(value)
+        if log.stop_requested:
+            raise _Stopped
+
+    def _on_checkpoint(self, saved: Saved) -> None:
+        """Write a checkpoint; raise where a callback ends the stage."""
+        self.log.stands(saved.at.update, saved.at.steps, saved.at.seconds)
+        self.log.save(self._saved(saved.extra))
+        if self.log.stop_requested:
+            raise _Stopped
+
+    def _saved(self, extra: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return all tensors of a checkpoint, ``extra`` included."""
+        for name, state in self.states().items():
+            extra = extra | prefixed(f"state.{name}", vars(state))
+        return extra | self.best.tensors()
+
+    def _save_final(self, *, spent: bool) -> None:
+        """Write the state from which more steps continue, in new episodes.
+
+        Args:
+            spent: the budget is spent, so the state is a checkpoint, too.
+        """
+        whole = prefixed("learner", self.learner.kept(requested=False))
+        needed = prefixed("learner", self.learner.kept(requested=False, replay=False))
+        spare = {k: v for k, v in whole.items() if k not in needed}
+        self.log.save_final(self._saved(needed), spare, spent=spent)
+
+    def _is_unchanged(self) -> bool:
+        """Return True if the weights of the only learner are still the initial ones."""
+        ((name, policy),) = self.policies().items()
+        before = AgentPolicy.of(policy.algorithm, self._initial_state(name)).weights
+        return all(torch.equal(policy.weights[k], before[k]) for k in before)
+
+    def _report_not_called(self, steps: int) -> None:
+        """Report skills that were not called so far, while training can still be stopped."""
+        counts = {} if self.joint is None else self.joint.counts
+        for name, (rows, _) in counts.items():
+            if not rows and not decides(name):
+                self.log.message(
+                    f"skill {name!r} was not called in the first {steps:,} steps; it starts to "
+                    "learn once its initiation() is True where other skills end"
+                )
+
+    def _report_little_learnt(self) -> None:
+        """Report skills that learnt nothing beside others."""
+        steps, counts = self.log.at.steps, {} if self.joint is None else self.joint.counts
+        for name, (rows, updates) in counts.items():
+            if decides(name):
+                continue
+            if rows and not updates:
+                more = "raise together.epsilon, " if self.entry.decides in counts else ""
+                self.log.message(
+                    f"skill {name!r} acted in {rows:,} of {steps:,} steps only, too few "
+                    f"to learn from once: lower together.quota, {more}or give more steps"
+                )
+            elif not rows:
+                self.log.message(
+                    f"skill {name!r} was never called in {steps:,} steps, so it learnt "
+                    "nothing: perhaps its initiation() is never True where the other skills "
+                    "lead, or the selector never chooses it"
+                )
+
+    def close(self) -> None:
+        """Release the environments."""
+        self._resources.close()
+
+
+def _collector(
+    task: LearningTask,
+    algorithms: Mapping[str, Algorithm],
+    margins: Mapping[str, float],
+    seeds: Seeds,
+    num_envs: int,
+    first: int,
+) -> Collector:
+    """Make a collector after seeding the global generators of its process."""
+    seed_global_generators(seeds / first)
+    return task.logged(_acting_in(task.engine(num_envs, first), task, algorithms, margins))
+
+
+def _acting_in(
+    engine: Engine,
+    task: LearningTask,
+    algorithms: Mapping[str, Algorithm],
+    margins: Mapping[str, float],
+) -> Collector:
+    """Return a collector in which all learners act, by their paths in the level."""
+    acting = {k: Acting([(a, 1)], engine.num_envs) for k, a in algorithms.items()}
+    if task.roles is None:
+        (alone,) = acting.values()
+        return Collector(engine, alone, task.who)
+    return Collector(engine, acting.pop(SELECTOR, None), task.who, acting, margins)
+
+
+class _TargetReached(Exception):
+    """Signal that ends a loop: the target is reached by this value."""
+
+
+class _Stopped(Exception):
+    """Signal that ends a loop: a callback has returned False."""
