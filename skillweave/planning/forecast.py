@@ -13,7 +13,7 @@ from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.handover import wilson
 from skillweave.planning.lacking import names_of, read_log
-from skillweave.planning.machine import RewardMachine, predicate_of
+from skillweave.planning.machine import RewardMachine, predicates_of
 from skillweave.planning.planner import Planner
 from skillweave.policies.plan import Readings
 from skillweave.policies.planned import SLACK
@@ -187,9 +187,9 @@ def _usual_calls(history: Array, skills: tuple[str, ...]) -> tuple[tuple[str, fl
 def _reason(machine: RewardMachine, state: Array, log: CallLog, known: Readings | None) -> str:
     """Return where most episodes end that fail, in these states (n,)."""
     begins = log.offset[:-1][log.order == 0]
-    for arrow in machine.arrows[machine.plan.start]:
+    for arrow in machine.leaving[machine.acts.first]:
         if known is not None and machine.failing[arrow.target]:
-            numbers = [machine.number(predicate_of(atom)) for atom in arrow.atoms]
+            numbers = [*map(machine.number, predicates_of(arrow))]
             holds = known.events[begins][:, numbers].all(1).mean()
             if holds > 0.5:
                 bad = names_of([arrow])

@@ -113,7 +113,7 @@ class Planner(ReadySelector):
         self.log = fitted(CallLog, log, "Planner: log")
         self.task = as_task(task, predicates)
         self.skills, self.lengths = log.skills, log.lengths
-        if isinstance(self.task, RewardMachine) and not self.task.plan.pays:
+        if isinstance(self.task, RewardMachine) and not self.task.pays:
             raise DeclarationError(
                 "the RewardMachine pays nothing, so there is nothing to plan: give a transition a "
                 "reward, {('from', 'to'): (event, 1.0)}, or name accepting states, which then pay 1"
