@@ -18,7 +18,7 @@ from skillweave.planning.compared import feature_maps
 from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
 from skillweave.planning.neighbors import Standard, nearest
-from skillweave.planning.predicates import as_event
+from skillweave.planning.predicates import Event, Held, as_event
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import weights_of
 from skillweave.schema import fitted
@@ -271,19 +271,14 @@ def calls_done(log: CallColumns, done: Mapping[str, Any] | None) -> Array:
     return won
 
 
-def happened(log: CallColumns, event: Any) -> Array:
+def happened(log: CallColumns, event: Event) -> Array:
     """Return the calls within which an event happened, (C,) bool."""
-    task = Mission(event)
-    readings = read_log(task, log)
-    tau, over = log.tau, np.zeros(len(log), bool)
-    state = task.start(len(log))
-    for k in range(int(tau.max(initial=0))):
-        rows = np.flatnonzero((tau > k) & ~over)
-        if not len(rows):
-            break
-        state[rows], _ = task.acts.advance(state[rows], readings.take(log.offset[rows] + k))
-        over[rows] = task.is_over(state[rows])
-    return over
+    steps = event.steps if isinstance(event, Held) else 1
+    # By step, how often it held so far; the predicate is the first of the task's events.
+    count = np.cumsum(np.pad(read_log(Mission(event), log).events[:, 0], (steps, 0)))
+    full = (count[steps:] - count[:-steps] == steps) & (log.elapsed >= steps)
+    found: Array = np.bincount(log.owner[full], minlength=len(log)) > 0
+    return found
 
 
 def wilson(successes: Any, trials: Any) -> tuple[Array, Array]:
