@@ -109,8 +109,8 @@ class Handover:
             if never[j]:
                 continue
             skill, elsewhere = self.skills[j], shown_rate(done[i, j], calls[i, j])
-            where = "at the start of an episode" if i == 0 else f"after {self.before[i]!r}"
             does = "ends by itself" if skill in self.by_itself else "succeeds"
+            where = "at the start of an episode" if i == 0 else f"after {self.before[i]!r}"
             here = shown_rate(self.done[i, j], self.calls[i, j])
             sentences.append(f"{skill!r} {does} in {here} {where}; in {elsewhere} elsewhere")
         return sentences
@@ -590,9 +590,9 @@ class LinkedCalls(CallColumns):
                 "more calls, chosen at random"
             )
         others = np.flatnonzero(counts & (before >= 0) & (before != wanted))
-        elsewhere = float(won[others].mean()) if len(others) else float("nan")
-        reasons = self.take(rows[~won[rows]]).reasons
-        rate, nan = float(won[rows].mean()), float("nan")
+        nan, did = float("nan"), won[rows]
+        elsewhere = float(won[others].mean()) if len(others) else nan
+        reasons, rate = self.take(rows[~did]).reasons, float(did.mean())
         unknown = Blame(
             skill, after, rate, elsewhere, len(rows), len(others), nan, nan, None, (nan, nan),
             reasons, False,
@@ -610,12 +610,10 @@ class LinkedCalls(CallColumns):
         )
         best = np.zeros(len(rows), bool)
         best[np.argsort(-score, kind="stable")[: _third(len(rows))]] = True
-        good, bad = float(won[rows[best]].mean()), float(won[rows[~best]].mean())
+        good, bad = float(did[best].mean()), float(did[~best].mean())
         as_elsewhere = rate if np.isnan(elsewhere) else elsewhere
-        low, high = (
-            wilson(won[rows[best]].sum(), best.sum())[0],
-            wilson(won[rows[~best]].sum(), (~best).sum())[1],
-        )
+        low, _ = wilson(did[best].sum(), best.sum())
+        _, high = wilson(did[~best].sum(), (~best).sum())
         first = good >= as_elsewhere - LIKE_ELSEWHERE and good - bad >= WORSE and low > high
         place, means = _largest_difference(starts[rows], best, changes)
         return replace(unknown, best=good, others=bad, place=place, means=means, first=bool(first))
