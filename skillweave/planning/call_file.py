@@ -16,11 +16,10 @@ from skillweave.algorithms.batches import INFO
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.planning.columns import (
     GOAL,
-    PER_CALL,
-    PER_STEP,
     CallColumns,
     call_fields,
     columns_of,
+    fields_of,
 )
 from skillweave.policies.core import CallEnd
 from skillweave.runs.files import read_tensors, record_in, write_tensors
@@ -39,7 +38,7 @@ from skillweave.types import LARGEST_REWARD, Array
 
 PER_SKILL = ("checksums", "sees", "recurrent", "own_success")
 """Fields with a value for each skill."""
-PLAIN = ("skills", "lengths", *PER_SKILL)
+PLAIN = ("skills", "lengths", *PER_SKILL, "code")
 """Fields that the header has as they are."""
 RANGES: dict[str, tuple[float, float]] = {
     "end_reason": (1, max(CallEnd)),
@@ -96,7 +95,6 @@ def write_calls(path: str | Path, log: CallColumns, run: LoggedRun | None = None
         action_space=space_to_json(log.action_space),
         info=tuple(log.info),
         goals=tuple(log.goals),
-        code=log.code,
         run=run,
     )
     tensors = {name: to_tensor(value) for name, value in columns_of(log).items()}
@@ -115,45 +113,32 @@ def read_calls(path: str | Path) -> dict[str, Any]:
         raise RunError(f"{path} holds no log of calls; give a file that CallLog.save() wrote")
     of: CallsHeader = record_in(CallsHeader, header, path)
     try:
-        spaces = map(space_from_json, (of.observation_space, of.action_space))
-        return _fields(tensors, of, *spaces)
+        observation, action = map(space_from_json, (of.observation_space, of.action_space))
+        _check(of, obs_codec(observation).size)
+        columns = _columns(tensors, of, observation, action)
     except (ValueError, SkillweaveError) as error:
         raise RunError(f"{path} is damaged: {error}") from error
+    return {
+        **fields_of(columns),
+        **{name: getattr(of, name) for name in PLAIN},
+        "observation_space": observation,
+        "action_space": action,
+    }
 
 
-def _fields(
-    tensors: dict[str, Tensor],
-    header: CallsHeader,
-    observation: gym.Space[Any],
-    action: gym.Space[Any],
-) -> dict[str, Any]:
-    """Return the checked fields; a ValueError says what is wrong."""
+def _check(header: CallsHeader, places: int) -> None:
+    """Raise a ValueError where a header contradicts itself, or ``places`` numbers observed."""
     skills, lengths = header.skills, header.lengths
     if not skills or len(set(skills)) != len(skills) or not all(map(NAME.fullmatch, skills)):
         raise ValueError("its skills have no names, or two the same")
     if list(lengths) != sorted(set(lengths)):
         raise ValueError("its lengths do not rise")
-    plain = {name: getattr(header, name) for name in PLAIN}
-    if any(len(plain[name]) != len(skills) for name in PER_SKILL):
+    if any(len(getattr(header, name)) != len(skills) for name in PER_SKILL):
         raise ValueError("its header does not have an entry for each skill")
-    places = obs_codec(observation).size
     if any(place >= places for seen in header.sees for place in seen or ()):
         raise ValueError(f"'sees' has places beyond the {places} of an observation")
     if not set(header.goals) <= set(skills):
         raise ValueError("it has goals of other skills")
-    columns = _columns(tensors, header, observation, action)
-    offset = columns["offset"]
-    if offset[0] != 0 or offset[-1] != len(columns["reward"]) or (offset[1:] <= offset[:-1]).any():
-        raise ValueError("'offset' is out of range")
-    return {
-        **{name: columns[name] for name in (*PER_CALL, *PER_STEP, "offset")},
-        **plain,
-        "observation_space": observation,
-        "action_space": action,
-        "info": {key: columns[INFO + key] for key in header.info},
-        "goals": {name: columns[GOAL + name] for name in header.goals},
-        "code": header.code,
-    }
 
 
 def _columns(
@@ -167,16 +152,15 @@ def _columns(
     calls, steps = (math.prod(of.get(name, ())) for name in ("choice", "reward"))
     choices = len(header.skills) * max(1, len(header.lengths))
     acts = obs_dtype(action)
-    next_obs = obs_dtype(observation), (steps, *obs_shape(observation))
     # Of a goal and a value of `info` the size is free, and the type of numbers that `info` holds.
     sizes = {name: math.prod(of.get(GOAL + name, ())[-1:]) for name in header.goals}
     row = np.dtype(call_fields(observation, choices, sizes))
-    columns = ((name, row[name]) for name in row.names or ())
+    per_call = ((name, row[name]) for name in row.names or ())
     table: dict[str, tuple[Any, tuple[int, ...]]] = {
-        **{name: (of_row.base, (calls, *of_row.shape)) for name, of_row in columns},
+        **{name: (of_row.base, (calls, *of_row.shape)) for name, of_row in per_call},
         "offset": (np.int64, (calls + 1,)),
         "reward": (np.float32, (steps,)),
-        "next_obs": next_obs,
+        "next_obs": (obs_dtype(observation), (steps, *obs_shape(observation))),
         "action": (acts if acts.fields else None, (steps, *obs_shape(action))),
         **{INFO + key: (None, (steps, *of.get(INFO + key, ())[1:])) for key in header.info},
     }
@@ -184,10 +168,14 @@ def _columns(
     if tensors.keys() != table.keys():
         raise ValueError(f"it has the columns {', '.join(sorted(tensors))}"[:300])
     free = -np.inf, np.inf
-    return {
+    columns = {
         name: _column(name, tensors[name], *one, *limits.get(name, free))
         for name, one in table.items()
     }
+    offset = columns["offset"]
+    if offset[0] != 0 or offset[-1] != steps or (offset[1:] <= offset[:-1]).any():
+        raise ValueError("'offset' is out of range")
+    return columns
 
 
 def _column(

@@ -13,7 +13,7 @@ import numpy as np
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, RunError
 from skillweave.planning.call_file import read_calls, write_calls
-from skillweave.planning.columns import PER_CALL, PER_STEP
+from skillweave.planning.columns import columns_of, fields_of
 from skillweave.planning.handover import LinkedCalls
 from skillweave.policies.files import checksum
 from skillweave.runs.user_code import (
@@ -182,27 +182,15 @@ def join(logs: Iterable[CallLog]) -> CallLog:
                 f"one log has the info keys {', '.join(first.info) or 'none'}, another "
                 f"{', '.join(log.info) or 'none'}; record the same keys"
             )
-    episodes, offsets = [], [np.zeros(1, np.int64)]
-    next_episode = steps = 0
+    episodes, next_episode = [], 0
     for log in logs:
-        episodes.append(log.episode - log.episode.min(initial=0) + next_episode)
+        episodes.append(log.episode + next_episode)
         next_episode = int(episodes[-1].max(initial=next_episode - 1)) + 1
-        offsets.append(log.offset[1:] + steps)
-        steps += log.steps
-    whole: dict[str, Any] = {
-        name: np.concatenate([getattr(log, name) for log in logs])
-        for name in (*PER_CALL, *PER_STEP)
-        if name != "episode"
-    }
-    info = {key: np.concatenate([log.info[key] for log in logs]) for key in first.info}
-    return replace(
-        first,
-        **whole,
-        episode=np.concatenate(episodes),
-        offset=np.concatenate(offsets),
-        info=info,
-        goals={name: np.concatenate([log.goals[name] for log in logs]) for name in first.goals},
-    )
+    every = [columns_of(log) for log in logs]
+    columns = {name: np.concatenate([of[name] for of in every]) for name in every[0]}
+    columns["episode"] = np.concatenate(episodes)
+    columns["offset"] = np.cumsum(np.concatenate([[0], *(log.tau for log in logs)]))
+    return replace(first, **fields_of(columns))
 
 
 def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[str, ...]:

@@ -213,14 +213,9 @@ class CallColumns(Choices):
         offset = np.concatenate([[0], np.cumsum(tau)]).astype(np.int64)
         # The k-th step of a call is k behind its first.
         steps = np.arange(offset[-1]) + np.repeat(self.offset[rows] - offset[:-1], tau)
-        return replace(
-            self,
-            **{name: getattr(self, name)[rows] for name in PER_CALL},
-            **{name: getattr(self, name)[steps] for name in PER_STEP},
-            offset=offset,
-            info={key: value[steps] for key, value in self.info.items()},
-            goals={name: goal[rows] for name, goal in self.goals.items()},
-        )
+        per_step = (*PER_STEP, *(INFO + key for key in self.info))
+        columns = {k: x[steps if k in per_step else rows] for k, x in columns_of(self).items()}
+        return replace(self, **fields_of(columns) | {"offset": offset})
 
     def within(self, steps: int) -> Self:
         """Return the first calls, as many as have at most ``steps`` steps in all."""
@@ -231,8 +226,21 @@ class CallColumns(Choices):
         return self.take(np.flatnonzero(self.steps - self.offset[:-1] <= steps))
 
 
-def columns_of(log: CallColumns) -> Mapping[str, Array]:
+def columns_of(log: CallColumns) -> dict[str, Array]:
     """Return all arrays of a log by name."""
     named = {name: getattr(log, name) for name in (*PER_CALL, "offset", *PER_STEP)}
     named |= {INFO + key: value for key, value in log.info.items()}
     return named | {GOAL + name: value for name, value in log.goals.items()}
+
+
+def fields_of(columns: Mapping[str, Array]) -> dict[str, Any]:
+    """Return the fields of a log whose ``columns_of`` these are."""
+    fields: dict[str, Any] = {"info": {}, "goals": {}}
+    for name, column in columns.items():
+        if name.startswith(INFO):
+            fields["info"][name.removeprefix(INFO)] = column
+        elif name.startswith(GOAL):
+            fields["goals"][name.removeprefix(GOAL)] = column
+        else:
+            fields[name] = column
+    return fields

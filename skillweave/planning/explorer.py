@@ -8,7 +8,7 @@ import numpy as np
 
 from skillweave._internal.arguments import checked_names
 from skillweave.planning.calls import CallLog
-from skillweave.planning.graph import CallGraph, planning_states
+from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbors import check_features
 from skillweave.policies.core import Memory, Policy, Turn
@@ -73,13 +73,11 @@ class Explorer(Policy):
         if len(log) < 2:
             return
         graph = CallGraph(log, self._features, self._neighbors)
-        nothing = RewardMachine({})
-        readings = nothing.acts.read(graph.log.as_steps())
-        judged = graph.judge(
-            nothing, planning_states(nothing), readings, self._gamma, graph.terminated
-        )
         self._far = self._radius_of(graph)
-        worth = graph.solve(judged, graph.after, graph.may, novel=self._far)
+        worth = graph.solve(
+            RewardMachine({}), self._gamma, graph.terminated, graph.after, graph.may,
+            novel=self._far,
+        )  # fmt: skip
         self._graph, self._worth = graph, worth[:, 0]
 
     def _radius_of(self, graph: CallGraph) -> Array:

@@ -9,11 +9,10 @@ import numpy as np
 from skillweave.errors import RunError
 from skillweave.planning.calls import CallLog
 from skillweave.planning.compared import leaves
-from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.handover import wilson
 from skillweave.planning.lacking import names_of, read_log
-from skillweave.planning.machine import RewardMachine, predicate_of
+from skillweave.planning.machine import RewardMachine, predicates_of
 from skillweave.planning.planner import Planner
 from skillweave.policies.plan import Readings
 from skillweave.policies.planned import SLACK
@@ -80,18 +79,19 @@ def forecast(planner: Planner) -> Forecast:
     Raises:
         RunError: the log has no start of an episode.
     """
-    graph, log, task, machine = planner.graph, planner.graph.log, planner.task, planner.machine
+    graph, machine, observed = planner.graph, planner.machine, planner.observed
+    log = graph.log
     rng = np.random.default_rng(0)
     starts = np.flatnonzero(planner.log.order == 0)
     if not len(starts):
         raise RunError("the log has no start of an episode, so no plan can be judged by it")
-    n = GOALS if isinstance(task, GoalTask) and task.columns is not None else EPISODES
+    n = EPISODES if observed is None else GOALS
     before = log.before
     first = planner.log.start[starts[np.arange(n) * len(starts) // n]]
     fixed = [(a == b).all(0) for a, b in zip(*map(leaves, (before, log.next_obs)), strict=True)]
     cut = planner.log.was_cut
     limit = (planner.log.age + planner.log.tau)[cut].max(initial=0) or np.inf
-    known = None if isinstance(task, GoalTask) else read_log(task, log)
+    known = read_log(machine, log)
     obs, state, elapsed = first.copy(), machine.start(n), np.zeros(n, np.int64)
     may, running = np.ones((n, log.choices), bool), np.ones(n, bool)
     if graph.skills is not None:
@@ -114,12 +114,10 @@ def forecast(planner: Planner) -> Forecast:
         goes_on = np.isfinite(far)
         while goes_on.any():
             some, steps = here[goes_on], step[goes_on]
-            if known is not None:
-                readings = known.take(steps)
-            elif isinstance(task, GoalTask):
-                there = task.holds(log.next_obs[steps], task.of(first[some]))
-                events = np.stack([there, np.zeros_like(there), np.ones_like(there)], 1)
-                readings = Readings(events, np.zeros((len(some), 1)))
+            readings = known.take(steps)
+            if observed is not None:  # the goal is that of the episode, not of the logged call
+                there = observed.holds(log.next_obs[steps], observed.of(first[some]))
+                readings.events[:, 0] = there
             state[some] = machine.acts.advance(state[some], readings)[0]
             elapsed[some] += 1
             step += goes_on
@@ -184,12 +182,12 @@ def _usual_calls(history: Array, skills: tuple[str, ...]) -> tuple[tuple[str, fl
     return tuple((skills[i], s) for i, s in zip(order, np.mean(steps, 0).tolist(), strict=True))
 
 
-def _reason(machine: RewardMachine, state: Array, log: CallLog, known: Readings | None) -> str:
+def _reason(machine: RewardMachine, state: Array, log: CallLog, known: Readings) -> str:
     """Return where most episodes end that fail, in these states (n,)."""
     begins = log.offset[:-1][log.order == 0]
-    for arrow in machine.arrows[machine.plan.start]:
-        if known is not None and machine.failing[arrow.target]:
-            numbers = [machine.number(predicate_of(atom)) for atom in arrow.atoms]
+    for arrow in machine.leaving[machine.acts.first]:
+        if machine.failing[arrow.target]:
+            numbers = [*map(machine.number, predicates_of(arrow))]
             holds = known.events[begins][:, numbers].all(1).mean()
             if holds > 0.5:
                 bad = names_of([arrow])

@@ -10,7 +10,7 @@ from everywhere that it passed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,6 +22,7 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.planning.calls import CallLog
 from skillweave.planning.compared import feature_maps
 from skillweave.planning.goal import GoalTask
+from skillweave.planning.lacking import check_possible, read_log
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbors import Standard, evenly, tie_order
 from skillweave.policies.core import CallEnd
@@ -71,22 +72,8 @@ class Pieces:
     """(P,) int64, its first step in the log."""
     stop: Array
     """(P,) int64, the step behind its last one."""
-    then: Array
-    """(P,) int64, the next piece of the same call; −1: the call ends."""
-
-
-@dataclass(frozen=True)
-class Judged:
-    """The outcome of every piece for a task, from each of its M planning states."""
-
-    reward: Array
-    """(P, M) float32, Σ γᵏ rₖ within the piece."""
-    follows: Array
-    """(P, M, J) int32, planning states after it."""
-    weights: Array
-    """(P, M, J) float32, of these."""
-    discount: Array
-    """(P,) float32, γ to the number of steps; 0 where nothing follows."""
+    last: Array
+    """(P,) bool: its call ends with it; else the next piece goes on."""
 
 
 class CallGraph:
@@ -142,9 +129,15 @@ class CallGraph:
         """(O,) int64, the choice of each option."""
         self.known = np.bincount(pieces.choice, minlength=log.choices)[self.choice_of] > 0
         """(O,) bool: the log has a call of the option's choice."""
-        last = pieces.then < 0
-        steps, self._end_of = np.unique(pieces.stop[last] - 1, return_inverse=True)
-        self._last = np.flatnonzero(last)
+        self._last = np.flatnonzero(pieces.last)
+        steps, end = np.unique(pieces.stop[self._last] - 1, return_inverse=True)
+        each = np.arange(len(pieces.last))
+        at = np.searchsorted(self._last, each)
+        self.end_of = end[at]
+        """(P,) int64, the end of the call that each piece is of."""
+        depth = self._last[at] - each
+        self._depths = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
+        """Pieces before the last of a call: those whose next one is known come first."""
         self.end_step = steps
         """(E,) int64, the last step before each end."""
         self.end = log.next_obs[steps]
@@ -165,21 +158,11 @@ class CallGraph:
         parts = np.flatnonzero(~whole)
         if len(parts) and skills is not None and skills.hierarchy.restricts:
             self.may[parts] = skills.hierarchy.may_start(self.end[parts])
-        self._end_features = [each(self.end) for each in self.maps]
-        self._depths = _by_depth(pieces.then)
+        self._end_features = [features(self.end) for features in self.maps]
 
     def near(self, obs: Array, most: int = 0) -> Near:
         """Return the nearest pieces of each choice to observations (n, …): K, or ``most``."""
         return self.options.near([each(obs) for each in self.maps], most)
-
-    @cached_property
-    def end_of(self) -> Array:
-        """The end of the call that each piece is of, (P,) int64."""
-        end = np.empty(len(self.pieces.call), np.int64)
-        end[self._last] = self._end_of
-        for rows in self._depths:
-            end[rows] = end[self.pieces.then[rows]]
-        return end
 
     def _groups(self, starts: Array, aims: list[Array | None]) -> Iterator[OptionGroup]:
         """Yield the options of all choices, by groups that share their calls.
@@ -237,79 +220,49 @@ class CallGraph:
             getattr(near, name)[cut[rows], options] = getattr(others, name)[rows, options]
         return near
 
-    def judge(
-        self,
-        task: RewardMachine,
-        states: Levels,
-        readings: Readings,
-        gamma: float,
-        over: Array,
-    ) -> Judged:
-        """Return what each piece pays and leads to, from each planning state of a task.
-
-        Args:
-            task: the machine.
-            states: its planning states.
-            readings: the machine's, of all steps of the log.
-            gamma: γ of one step.
-            over: (E,) bool, the ends after which nothing follows.
-        """
-        pieces = self.pieces
-        steps = pieces.stop - pieces.first
-        # The longest come first, so that those which go on are always a part from the beginning.
-        order = np.argsort(-steps, kind="stable")
-        first, lengths = pieces.first[order], steps[order]
-        state = np.repeat(exact_states(states)[None], len(order), 0)
-        paid = np.zeros((len(order), states.count))
-        for k in range(int(lengths[0])):
-            m = int(np.searchsorted(-lengths, -k, side="left"))
-            state[:m], now = task.acts.advance(state[:m], readings.take(first[:m] + k))
-            paid[:m] += gamma**k * now
-        reward, final = np.empty(paid.shape, np.float32), np.empty_like(state)
-        reward[order], final[order] = paid, state
-        follows, weights = states.corners(final)
-        used = np.flatnonzero(weights.any((0, 1)))  # exact levels need one corner alone
-        discount = gamma ** steps.astype(np.float64)
-        discount[self._last] *= ~over[self._end_of]
-        return Judged(
-            reward, follows[..., used].astype(np.int32), weights[..., used],
-            discount.astype(np.float32),
-        )  # fmt: skip
-
     def solve(
         self,
-        judged: Judged,
+        task: RewardMachine,
+        gamma: float,
+        over: Array,
         near: Near,
         may: Array,
         *,
         caution: float = 0.0,
         novel: Array | None = None,
     ) -> Array:
-        """Return the worth of each piece from each planning state, (P, M).
+        """Return the worth of each piece from each planning state of a task, (P, M).
 
         A piece is worth what it pays and what follows: the next piece of its call, or at the call's
         end the best choice, by the weighted mean of its nearest pieces' worth.
 
         Args:
-            judged: what pieces pay and lead to.
+            task: the machine.
+            gamma: γ of one step.
+            over: (E,) bool, the ends after which nothing follows.
             near: the nearest pieces to the ends.
             may: (E, choices) bool, what may follow.
             caution: see ``Options.trust``.
             novel: (O,), the distance from which on each option is new, and worth 1; None: none
                 is.
+
+        Raises:
+            RunError: see ``read_log`` and ``check_possible``.
         """
-        count = judged.reward.shape[1]
-        value = np.zeros((len(self.end), count), np.float32)
+        readings = read_log(task, self.log)
+        check_possible(task, readings, self.log)
+        worth_of = self._judged(task, readings, gamma, over)
         trust = self.options.trust(near.distance, caution)
         options = np.flatnonzero(self.known | (novel is not None)).tolist()
         allowed = may[:, self.choice_of]
         if novel is None:
             allowed &= np.isfinite(near.distance)
+        value = np.zeros((len(self.end), planning_states(task).count), np.float32)
         for _ in range(MOST_SWEEPS):
-            worth = self._worth(judged, value)
+            worth = worth_of(value)
             best = np.full_like(value, -np.inf)
             for c in options:
-                q = np.zeros_like(value)
+                q = np.zeros_like(best)
                 for k in range(self.neighbors):
                     q += near.weights[:, c, k, None] * worth[near.pieces[:, c, k]]
                 q = np.where(q > 0, q * trust[:, c, None], q)
@@ -321,29 +274,48 @@ class CallGraph:
             value = best
             if change <= TOLERANCE * largest:
                 break
-        return self._worth(judged, value)
+        return worth_of(value)
 
-    def _worth(self, judged: Judged, value: Array) -> Array:
-        """Return the worth of pieces, (P, M), where the ends of calls have a ``value`` (E, M)."""
-        worth = np.zeros(judged.reward.shape, np.float32)
+    def _judged(
+        self, task: RewardMachine, readings: Readings, gamma: float, over: Array
+    ) -> Callable[[Array], Array]:
+        """Return a function: of the ends' values (E, M) to the worth of pieces, (P, M) float32."""
+        states, steps = planning_states(task), self.pieces.stop - self.pieces.first
+        # The longest come first, so that those which go on are always a part from the beginning.
+        order = np.argsort(-steps, kind="stable")
+        first, lengths = self.pieces.first[order], steps[order]
+        state = np.repeat(exact_states(states)[None], len(order), 0)
+        paid = np.zeros((len(order), states.count))
+        for k in range(int(lengths[0])):
+            m = int(np.searchsorted(-lengths, -k, side="left"))
+            state[:m], now = task.acts.advance(state[:m], readings.take(first[:m] + k))
+            paid[:m] += gamma**k * now
+        reward, final = np.empty(paid.shape, np.float32), np.empty_like(state)
+        reward[order], final[order] = paid, state
+        follows, weights = states.corners(final)
+        used = np.flatnonzero(weights.any((0, 1)))  # exact levels need one corner alone
+        follows, weights = follows[..., used].astype(np.int32), weights[..., used]
+        discount = gamma ** steps.astype(np.float64)
+        discount[self._last] *= ~over[self.end_of[self._last]]
+        discounts: Array = discount.astype(np.float32)[:, None]
 
-        def put(rows: Array, following: Array, place: Array) -> None:
-            after = following[place[:, None, None], judged.follows[rows]]
-            mean = (after * judged.weights[rows]).sum(2)
-            worth[rows] = judged.reward[rows] + judged.discount[rows, None] * mean
+        def worth_of(value: Array) -> Array:
+            worth: Array = np.zeros_like(reward)
+            ends = self.end_of[self._last]
+            parts = [(self._last, value, ends), *((rows, worth, rows + 1) for rows in self._depths)]
+            for rows, following, place in parts:
+                after = following[place[:, None, None], follows[rows]]
+                mean = (after * weights[rows]).sum(2)
+                worth[rows] = reward[rows] + discounts[rows] * mean
+            return worth
 
-        put(self._last, value, self._end_of)
-        for rows in self._depths:
-            put(rows, worth, self.pieces.then[rows])
-        return worth
+        return worth_of
 
     def for_goal(self, goal: GoalTask, place: Array) -> tuple[Near, Array]:
         """Return the nearest pieces to the ends, and what may follow, where the goal is ``place``.
 
         They differ from the usual ones only for skills that see the goal.
         """
-        if goal.columns is None:
-            return self.after, self.may
         end = goal.put(self.end, place)
         features = [each(end) for each in self.maps]
         same = all(np.array_equal(a, b) for a, b in zip(features, self._end_features, strict=True))
@@ -376,8 +348,7 @@ def _pieces(log: CallLog, skills: SkillSet | None) -> Pieces:
     first = log.offset[call] + number * steps
     last = number == counts[call] - 1
     stop = np.where(last, log.offset[call + 1], first + steps)
-    then = np.where(last, -1, np.arange(len(call)) + 1)
-    return Pieces(call, log.choice[call], first, stop, then)
+    return Pieces(call, log.choice[call], first, stop, last)
 
 
 def _beginnings(log: CallLog, skills: SkillSet | None) -> Pieces:
@@ -394,18 +365,7 @@ def _beginnings(log: CallLog, skills: SkillSet | None) -> Pieces:
             parts.append((longer, tau, log.skill[longer] * count + i))
     call, tau, choice = (np.concatenate(column) for column in zip(*parts, strict=True))
     first = log.offset[call]
-    return Pieces(call, choice, first, first + tau, np.full(len(call), -1))
-
-
-def _by_depth(then: Array) -> list[Array]:
-    """Return pieces before the last of a call: those whose next one is known come first."""
-    depth = np.zeros(len(then), np.int64)
-    rows = np.flatnonzero(then >= 0)
-    for row in rows[::-1]:  # the next piece has the next number
-        depth[row] = depth[then[row]] + 1
-    order = rows[np.argsort(depth[rows], kind="stable")]
-    bounds = np.flatnonzero(np.diff(depth[order])) + 1
-    return [part for part in np.split(order, bounds) if len(part)]
+    return Pieces(call, choice, first, first + tau, np.ones(len(call), bool))
 
 
 # The finite states that a task is planned in
@@ -423,10 +383,10 @@ def planning_states(task: RewardMachine) -> Levels:
             f"at most {MOST_COUNTERS} can be planned"
         )
     used = task.counter_steps < np.iinfo(np.int64).max
-    most = LEVELS
-    while most > FEWEST_LEVELS and _levels(task, most).prod(1).sum() > ENOUGH_STATES:
+    steps, most = np.where(used, task.counter_steps, 1), LEVELS
+    while most > FEWEST_LEVELS and np.minimum(steps, most).prod(1).sum() > ENOUGH_STATES:
         most //= 2
-    levels, steps = _levels(task, most), np.where(used, task.counter_steps, 1)
+    levels = np.minimum(steps, most)
     spacing = np.where(used, (steps - 1) / np.maximum(levels - 1, 1), 1.0)
     sizes = levels.prod(1)
     states = Levels(levels, spacing, np.cumsum(sizes) - sizes)
@@ -449,9 +409,3 @@ def exact_states(states: Levels) -> Array:
         exact[:, 1 + slot] = np.round(place % count * states.spacing[q, slot])
         place //= count
     return exact
-
-
-def _levels(task: RewardMachine, most: int) -> Array:
-    """Return the number of levels of each counter, (Q, H); 1 where it is not used."""
-    used = task.counter_steps < np.iinfo(np.int64).max
-    return np.where(used, np.minimum(task.counter_steps, most), 1)

@@ -18,7 +18,7 @@ from skillweave.planning.compared import feature_maps
 from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
 from skillweave.planning.neighbors import Standard, nearest
-from skillweave.planning.predicates import as_event
+from skillweave.planning.predicates import Event, Held, as_event
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import weights_of
 from skillweave.schema import fitted
@@ -109,8 +109,8 @@ class Handover:
             if never[j]:
                 continue
             skill, elsewhere = self.skills[j], shown_rate(done[i, j], calls[i, j])
-            where = "at the start of an episode" if i == 0 else f"after {self.before[i]!r}"
             does = "ends by itself" if skill in self.by_itself else "succeeds"
+            where = "at the start of an episode" if i == 0 else f"after {self.before[i]!r}"
             here = shown_rate(self.done[i, j], self.calls[i, j])
             sentences.append(f"{skill!r} {does} in {here} {where}; in {elsewhere} elsewhere")
         return sentences
@@ -271,19 +271,14 @@ def calls_done(log: CallColumns, done: Mapping[str, Any] | None) -> Array:
     return won
 
 
-def happened(log: CallColumns, event: Any) -> Array:
+def happened(log: CallColumns, event: Event) -> Array:
     """Return the calls within which an event happened, (C,) bool."""
-    task = Mission(event)
-    readings = read_log(task, log)
-    tau, over = log.tau, np.zeros(len(log), bool)
-    state = task.start(len(log))
-    for k in range(int(tau.max(initial=0))):
-        rows = np.flatnonzero((tau > k) & ~over)
-        if not len(rows):
-            break
-        state[rows], _ = task.acts.advance(state[rows], readings.take(log.offset[rows] + k))
-        over[rows] = task.is_over(state[rows])
-    return over
+    steps = event.steps if isinstance(event, Held) else 1
+    # By step, how often it held so far; the predicate is the first of the task's events.
+    count = np.cumsum(np.pad(read_log(Mission(event), log).events[:, 0], (steps, 0)))
+    full = (count[steps:] - count[:-steps] == steps) & (log.elapsed >= steps)
+    found: Array = np.bincount(log.owner[full], minlength=len(log)) > 0
+    return found
 
 
 def wilson(successes: Any, trials: Any) -> tuple[Array, Array]:
@@ -595,9 +590,9 @@ class LinkedCalls(CallColumns):
                 "more calls, chosen at random"
             )
         others = np.flatnonzero(counts & (before >= 0) & (before != wanted))
-        elsewhere = float(won[others].mean()) if len(others) else float("nan")
-        reasons = self.take(rows[~won[rows]]).reasons
-        rate, nan = float(won[rows].mean()), float("nan")
+        nan, did = float("nan"), won[rows]
+        elsewhere = float(won[others].mean()) if len(others) else nan
+        reasons, rate = self.take(rows[~did]).reasons, float(did.mean())
         unknown = Blame(
             skill, after, rate, elsewhere, len(rows), len(others), nan, nan, None, (nan, nan),
             reasons, False,
@@ -615,12 +610,10 @@ class LinkedCalls(CallColumns):
         )
         best = np.zeros(len(rows), bool)
         best[np.argsort(-score, kind="stable")[: _third(len(rows))]] = True
-        good, bad = float(won[rows[best]].mean()), float(won[rows[~best]].mean())
+        good, bad = float(did[best].mean()), float(did[~best].mean())
         as_elsewhere = rate if np.isnan(elsewhere) else elsewhere
-        low, high = (
-            wilson(won[rows[best]].sum(), best.sum())[0],
-            wilson(won[rows[~best]].sum(), (~best).sum())[1],
-        )
+        low, _ = wilson(did[best].sum(), best.sum())
+        _, high = wilson(did[~best].sum(), (~best).sum())
         first = good >= as_elsewhere - LIKE_ELSEWHERE and good - bad >= WORSE and low > high
         place, means = _largest_difference(starts[rows], best, changes)
         return replace(unknown, best=good, others=bad, place=place, means=means, first=bool(first))

@@ -8,7 +8,7 @@ import numpy as np
 
 from skillweave.errors import RunError, SkillError, SkillweaveError
 from skillweave.planning.columns import CallColumns
-from skillweave.planning.machine import Arrow, RewardMachine, predicate_of
+from skillweave.planning.machine import Arrow, RewardMachine, predicates_of
 from skillweave.planning.neighbors import Standard
 from skillweave.planning.predicates import Predicate
 from skillweave.policies.core import observed
@@ -47,16 +47,15 @@ def check_possible(task: RewardMachine, readings: Readings, log: CallColumns) ->
     The error names the predicates that never hold, and the skill that comes nearest to one.
     """
     happens = readings.events.max(0, initial=False)
-    reached, queue = {task.plan.start}, [task.plan.start]
+    reached, queue = {task.acts.first}, [task.acts.first]
     missing: dict[str, Predicate] = {}
-    pays = any(task.plan.each_step.values())
+    pays = bool(task.acts.each.any() or task.acts.each_by.any())
     while queue:
         state = queue.pop()
-        for arrow in task.arrows[state]:
-            atoms = [predicate_of(atom) for atom in arrow.atoms]
-            absent = [a for a in atoms if not happens[task.number(a)]]
+        for arrow in task.leaving[state]:
+            absent = [p for p in predicates_of(arrow) if not happens[task.number(p)]]
             if absent and not task.failing[arrow.target]:
-                missing |= {a.name: a for a in absent}
+                missing |= {p.name: p for p in absent}
             if not absent:
                 pays |= callable(arrow.reward) or arrow.reward > 0
                 if arrow.target not in reached:
@@ -88,7 +87,7 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
     follows[count, of[log.offset[:-1][log.order == 0]]] = True
     reached: Array = np.zeros((len(task.accepting), count + 1), bool)
     new = reached.copy()
-    new[task.plan.start, count] = True
+    new[task.acts.first, count] = True
     while new.any():
         reached |= new
         place, at = np.nonzero(new & ~(task.accepting | task.failing)[:, None])
@@ -100,7 +99,7 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
     states: Array = np.asarray(reached.any(1))
     if (states & task.accepting).any():
         return ""
-    arrows = [a for a in task.plan.arrows if states[a.origin]]
+    arrows = [a for a in task.arrows if states[a.origin]]
     wanted = names_of(a for a in arrows if not (states | task.failing)[a.target])
     text = f"no plan does this task by the log: {wanted} never holds"
     if before := names_of(a for a in arrows if states[a.target] and not task.failing[a.target]):
@@ -112,7 +111,7 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
 
 def names_of(arrows: Iterable[Arrow]) -> str:
     """Return the names of arrows' events, each once."""
-    names = (predicate_of(atom).name for arrow in arrows for atom in arrow.atoms)
+    names = (predicate.name for arrow in arrows for predicate in predicates_of(arrow))
     return " or ".join(map(repr, dict.fromkeys(names)))
 
 

@@ -7,7 +7,7 @@ Specification". An event that must hold for n steps has a counter, so n states a
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from gymnasium.spaces import Box
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, suggest
 from skillweave.errors import DeclarationError
-from skillweave.planning.predicates import Event, Held, Predicate, as_event
+from skillweave.planning.predicates import Event, Held, Predicate, as_event, predicate_of
 from skillweave.policies.plan import Machine
 from skillweave.policies.selectors import function_name
 from skillweave.schema import fitted
@@ -38,47 +38,15 @@ Reward = float | Callable[[Step], Any]
 
 
 @dataclass(frozen=True)
-class Counter:
-    """A counter of the steps in which a predicate has been true without a gap."""
-
-    slot: int
-    """Its column in a task's state, after the first."""
-    predicate: Predicate
-    steps: int
-
-
-Atom = Predicate | Counter
-
-
-@dataclass(frozen=True)
 class Arrow:
-    """A transition: it is taken where all its atoms hold."""
+    """A transition: it is taken where all its events hold."""
 
     origin: int
     target: int
-    atoms: tuple[Atom, ...]
+    events: tuple[Event, ...]
     reward: Reward = 0.0
     keeps: frozenset[int] = frozenset()
     """Slots of counters that go on counting after the transition."""
-
-
-@dataclass
-class Plan:
-    """The parts of a machine, before they become arrays."""
-
-    names: tuple[str, ...]
-    start: int
-    arrows: list[Arrow]
-    accepting: frozenset[int] = frozenset()
-    failing: frozenset[int] = frozenset()
-    each_step: dict[int, Reward] = field(default_factory=dict)
-    """The reward of every step in a state."""
-
-    @property
-    def pays(self) -> bool:
-        """True if a transition or a step of it has a reward."""
-        rewards = [*self.each_step.values(), *(arrow.reward for arrow in self.arrows)]
-        return any(callable(reward) or reward != 0.0 for reward in rewards)
 
 
 @checked_names
@@ -135,66 +103,108 @@ class RewardMachine:
         failing: Collection[str] = (),
         each_step: Any = 0.0,
     ) -> None:
-        plan = _declared(transitions, start, accepting, failing, each_step)
-        if not plan.pays:
-            plan.arrows = [
-                replace(arrow, reward=float(arrow.target in plan.accepting))
-                for arrow in plan.arrows
-            ]
-        self._build(plan)
-
-    def _build(self, plan: Plan) -> None:
-        """Turn the parts of a machine into arrays, one row for each state."""
-        if len(plan.names) > MOST_STATES:
+        check_transitions(transitions, "a RewardMachine's")
+        named: dict[str, int] = {}
+        for pair in transitions:
+            for state in pair:
+                named.setdefault(fitted(StateName, state, "a RewardMachine's state"), len(named))
+        if not named:
+            named[start if isinstance(start, str) and start else "always"] = 0
+        done, failed = (
+            frozenset(_number(name, named, what) for name in _states(states, what))
+            for states, what in ((accepting, "accepting"), (failing, "failing"))
+        )
+        if both := done & failed:
             raise DeclarationError(
-                f"the task has {len(plan.names):,} states; at most {MOST_STATES:,} are possible: "
+                f"RewardMachine: the state {[*named][min(both)]!r} is both accepting and failing; "
+                "choose one"
+            )
+        first = 0 if start is None else _number(start, named, "start")
+        over, arrows, slots = done | failed, list[Arrow](), dict[int, int]()
+        for pair, value in transitions.items():
+            origin, target = named[pair[0]], named[pair[1]]
+            if origin in over:
+                raise DeclarationError(
+                    f"RewardMachine: the state {pair[0]!r} ends the task, so it has no transition; "
+                    f"leave out {pair}"
+                )
+            for one in value if isinstance(value, list) else [value]:
+                event, reward = _event_and_reward(one, f"RewardMachine: transition {pair}")
+                if isinstance(event, Held):
+                    event = replace(event, slot=slots.get(origin, 0))
+                    slots[origin] = event.slot + 1
+                arrows.append(Arrow(origin, target, (event,), reward))
+        each = {q: r for q, r in _each_step(each_step, named).items() if q not in over}
+        if not any(callable(r) or r for r in (*each.values(), *(arrow.reward for arrow in arrows))):
+            arrows = [replace(arrow, reward=float(arrow.target in done)) for arrow in arrows]
+        self._build(tuple(named), arrows, done, failed, first, each)
+
+    def _build(
+        self,
+        names: tuple[str, ...],
+        arrows: Sequence[Arrow],
+        accepting: Collection[int],
+        failing: Collection[int],
+        first: int = 0,
+        each_step: Mapping[int, Reward] | None = None,
+    ) -> None:
+        """Turn the parts of a machine into arrays, one row for each state.
+
+        Args:
+            names: of the states.
+            arrows: in the order in which they are checked.
+            accepting: states.
+            failing: states.
+            first: the state at the start.
+            each_step: the reward of every step in a state.
+        """
+        if len(names) > MOST_STATES:
+            raise DeclarationError(
+                f"the task has {len(names):,} states; at most {MOST_STATES:,} are possible: "
                 "repeat it less often, or combine fewer sequences by 'and' or 'or'"
             )
-        self.plan, self.state_names = plan, plan.names
-        self.arrows: list[list[Arrow]] = [[] for _ in plan.names]
+        self.state_names, self.arrows = names, arrows
+        self.leaving: list[list[Arrow]] = [[] for _ in names]
         """The transitions from each state, in the order in which they are checked."""
-        for arrow in plan.arrows:
-            self.arrows[arrow.origin].append(arrow)
-        counters = [_counters(arrows) for arrows in self.arrows]
-        self.slots = max((slot + 1 for some in counters for slot in some), default=0)
+        for arrow in arrows:
+            self.leaving[arrow.origin].append(arrow)
+        self.slots = max((h.slot + 1 for arrow in arrows for h in _held(arrow)), default=0)
         """Counters side by side."""
         self.events: list[Predicate] = []
         self.rewards: list[Callable[[Step], Any]] = []
-        count, most = len(plan.names), max(1, *(len(a) for a in self.arrows))
-        atoms = max([1, *(len(a.atoms) for a in plan.arrows)])
+        count, most = len(names), max(1, *map(len, self.leaving))
+        atoms = max([1, *(len(arrow.events) for arrow in arrows)])
         if count * most * atoms > MOST_CELLS:
             raise DeclarationError(
                 f"the task has {count:,} states, of which one has {most:,} transitions; combine "
                 "fewer parts by 'and' or 'or', or repeat less often"
             )
-        for arrow in plan.arrows:
-            for atom in arrow.atoms:
-                self.number(predicate_of(atom))
+        for arrow in arrows:
+            for predicate in predicates_of(arrow):
+                self.number(predicate)
         # Two columns behind those of the events: one is never true, the other always.
         never, always = len(self.events), len(self.events) + 1
         counted = np.full((count, self.slots), never)
         self.counter_steps = np.full((count, self.slots), _NEVER)
         """Steps for which each counter must count, (Q, H); the largest number: it is not used."""
-        for q, some in enumerate(counters):
-            for slot, counter in some.items():
-                counted[q, slot] = self.number(counter.predicate)
-                self.counter_steps[q, slot] = counter.steps
         each_atom = np.full((count, most, atoms), always)
         each_atom[:, :, 0] = never
         target = np.arange(count)[:, None].repeat(most, 1)
         paid, paid_by = np.zeros((count, most)), np.zeros((count, most), np.int64)
         keeps = np.zeros((count, most, self.slots), bool)
-        for q, arrows in enumerate(self.arrows):
-            for t, arrow in enumerate(arrows):
-                each_atom[q, t, : len(arrow.atoms)] = [
-                    always + 1 + atom.slot if isinstance(atom, Counter) else self.number(atom)
-                    for atom in arrow.atoms
-                ]
+        for q, some in enumerate(self.leaving):
+            for t, arrow in enumerate(some):
+                for a, event in enumerate(arrow.events):
+                    each_atom[q, t, a] = number = self.number(predicate_of(event))
+                    if isinstance(event, Held):
+                        counted[q, event.slot] = number
+                        self.counter_steps[q, event.slot] = event.steps
+                        each_atom[q, t, a] = always + 1 + event.slot
                 target[q, t] = arrow.target
                 paid[q, t], paid_by[q, t] = self._reward(arrow.reward)
                 keeps[q, t, list(arrow.keeps)] = True
         each, each_by = np.zeros(count), np.zeros(count, np.int64)
-        for q, reward in plan.each_step.items():
+        for q, reward in (each_step or {}).items():
             each[q], each_by[q] = self._reward(reward)
         events = [
             (Wrapped(e.function, e.at if e.reads == "obs" else e.holds), e.reads)
@@ -205,13 +215,15 @@ class RewardMachine:
             for reward in self.rewards
         ]
         self.acts = Machine(
-            plan.start, counted, self.counter_steps, each_atom, target, paid, paid_by, keeps, each,
+            first, counted, self.counter_steps, each_atom, target, paid, paid_by, keeps, each,
             each_by, tuple(events), tuple(rewards),
         )  # fmt: skip
         """The task as data, by which a plan follows it."""
-        self.accepting = np.isin(np.arange(count), list(plan.accepting))
+        self.pays = bool(paid.any() or paid_by.any() or each.any() or each_by.any())
+        """A transition or a step of it has a reward."""
+        self.accepting = np.isin(np.arange(count), list(accepting))
         """The states in which the task has succeeded, (Q,) bool."""
-        self.failing = np.isin(np.arange(count), list(plan.failing))
+        self.failing = np.isin(np.arange(count), list(failing))
         """The states in which it has failed, (Q,) bool."""
 
     def number(self, predicate: Predicate) -> int:
@@ -300,10 +312,13 @@ class RewardMachine:
         states: dict[str, Any] = {}
         transitions: dict[tuple[str, str], Any] = {}
         for q, name in enumerate(self.state_names):
-            arrows = self.arrows[q]
-            calls = [_skills_of(a, skills) for a in arrows if not self.failing[a.target]]
-            chosen = list(dict.fromkeys(skill for some in calls for skill in some))
-            counters = list(_counters(arrows).values())
+            chosen = [
+                skill
+                for arrow in self.leaving[q]
+                if not self.failing[arrow.target]
+                for skill in _skills_of(arrow, skills)
+            ]
+            counters = self._counters(q)
             if len(counters) > 1:
                 raise DeclarationError(
                     f"in the state {name!r} the task waits for two events that must hold for "
@@ -316,59 +331,65 @@ class RewardMachine:
                     "of held() becomes one: plan the task instead"
                 )
             over = self.accepting[q] or self.failing[q]
+            calls = after if over or not chosen else list(dict.fromkeys(chosen))
             for i in range(steps):
-                states[_counted_name(name, i)] = after if over or not chosen else chosen
-            for i in range(steps):
-                transitions |= _automaton_arrows(self, arrows, name, counters, i)
-        return Automaton(states, transitions, self.state_names[self.plan.start])
+                states[_counted_name(name, i)] = calls
+                transitions |= self._automaton_arrows(q, counters, i)
+        return Automaton(states, transitions, self.state_names[self.acts.first])
+
+    def _automaton_arrows(
+        self, state: int, counters: Sequence[Held], count: int
+    ) -> dict[tuple[str, str], Callable[[Step], Any]]:
+        """Return an automaton's transitions from a state, whose counter stands at ``count``."""
+        name = self.state_names[state]
+        ways: dict[str, list[list[Predicate]]] = {}
+        for arrow in self.leaving[state]:
+            if any(count + 1 < held.steps for held in _held(arrow)):
+                continue
+            target, holds = self.state_names[arrow.target], predicates_of(arrow)
+            for counter in counters:
+                goes_on = any(counter.slot == held.slot for held in self._counters(arrow.target))
+                if counter.slot in arrow.keeps and goes_on and count + 1 < counter.steps:
+                    counted = _counted_name(target, count + 1)
+                    ways.setdefault(counted, []).append([*holds, counter.predicate])
+            ways.setdefault(target, []).append(holds)
+        for counter in counters:
+            if count + 1 < counter.steps:
+                ways.setdefault(_counted_name(name, count + 1), []).append([counter.predicate])
+            if count:
+                ways.setdefault(name, []).append([~counter.predicate])
+        origin = _counted_name(name, count)
+        return {(origin, target): _any_of(some) for target, some in ways.items()}
+
+    def _counters(self, state: int) -> list[Held]:
+        """Return the events of several steps that a state waits for, each counter once."""
+        held = {h.slot: h for arrow in self.leaving[state] for h in _held(arrow)}
+        return list(held.values())
 
 
-_Way = tuple[Sequence[Predicate], bool]
+def predicates_of(arrow: Arrow) -> list[Predicate]:
+    """Return the predicates that an arrow's events read."""
+    return [predicate_of(event) for event in arrow.events]
+
+
+def _held(arrow: Arrow) -> list[Held]:
+    """Return an arrow's events of several steps."""
+    return [event for event in arrow.events if isinstance(event, Held)]
 
 
 def _counted_name(name: str, count: int) -> str:
     return name if count == 0 else f"{name} ({count} steps held)"
 
 
-def _automaton_arrows(
-    task: RewardMachine, arrows: Sequence[Arrow], name: str, counters: Sequence[Counter], count: int
-) -> dict[tuple[str, str], Callable[[Step], Any]]:
-    """Return an automaton's transitions from one state, whose counter stands at ``count``."""
-    ways: dict[tuple[str, str], list[_Way]] = {}
-
-    def add(target: str, atoms: Sequence[Predicate], wanted: bool = True) -> None:
-        ways.setdefault((_counted_name(name, count), target), []).append((atoms, wanted))
-
-    for arrow in arrows:
-        full = all(count + 1 >= a.steps for a in arrow.atoms if isinstance(a, Counter))
-        if not full:
-            continue
-        target, atoms = task.state_names[arrow.target], [predicate_of(a) for a in arrow.atoms]
-        for counter in counters:
-            goes_on = counter.slot in _counters(task.arrows[arrow.target])
-            if counter.slot in arrow.keeps and goes_on and count + 1 < counter.steps:
-                add(_counted_name(target, count + 1), [*atoms, counter.predicate])
-        add(target, atoms)
-    for counter in counters:
-        if count + 1 < counter.steps:
-            add(_counted_name(name, count + 1), [counter.predicate])
-        if count:
-            add(name, [counter.predicate], wanted=False)
-    return {pair: _any_of(some) for pair, some in ways.items()}
-
-
-def _any_of(ways: Sequence[_Way]) -> Callable[[Step], Any]:
-    """Return the event that all predicates of one of the ways hold; or, if not wanted, do not."""
+def _any_of(ways: Sequence[Sequence[Predicate]]) -> Callable[[Step], Any]:
+    """Return the event that all predicates of one of the ways hold."""
 
     def event(step: Step) -> Array:
-        holds = [
-            np.logical_and.reduce([p.holds(step) for p in some]) == wanted for some, wanted in ways
-        ]
+        holds = [np.logical_and.reduce([p.holds(step) for p in some]) for some in ways]
         found: Array = np.logical_or.reduce(holds)
         return found
 
-    names = ("not " * (not wanted) + " and ".join(p.name for p in some) for some, wanted in ways)
-    event.__name__ = " or ".join(names)
+    event.__name__ = " or ".join(" and ".join(p.name for p in some) for some in ways)
     return event
 
 
@@ -379,8 +400,7 @@ def _names(skills: Any) -> list[str]:
 def _skills_of(arrow: Arrow, skills: Mapping[str, Any]) -> list[str]:
     """Return the skills of an arrow's events."""
     chosen: list[str] = []
-    for atom in arrow.atoms:
-        name = predicate_of(atom).name
+    for name in (predicate.name for predicate in predicates_of(arrow)):
         if name not in skills:
             raise DeclarationError(
                 f"automaton(): the event {name!r} has no skill; give one: "
@@ -388,62 +408,6 @@ def _skills_of(arrow: Arrow, skills: Mapping[str, Any]) -> list[str]:
             )
         chosen += _names(skills[name])
     return chosen
-
-
-def predicate_of(atom: Atom) -> Predicate:
-    """Return the predicate that an atom reads."""
-    return atom.predicate if isinstance(atom, Counter) else atom
-
-
-def _counters(arrows: Sequence[Arrow]) -> dict[int, Counter]:
-    """Return the counters that the arrows of one state wait for, by slot."""
-    return {a.slot: a for arrow in arrows for a in arrow.atoms if isinstance(a, Counter)}
-
-
-def _declared(transitions: Any, start: Any, accepting: Any, failing: Any, each_step: Any) -> Plan:
-    """Check the arguments of a machine, and return its parts."""
-    check_transitions(transitions, "a RewardMachine's")
-    named: dict[str, int] = {}
-    for pair in transitions:
-        for state in pair:
-            named.setdefault(fitted(StateName, state, "a RewardMachine's state"), len(named))
-    if not named:
-        named[start if isinstance(start, str) and start else "always"] = 0
-    ends = [
-        frozenset(_number(name, named, what) for name in _states(states, what))
-        for states, what in ((accepting, "accepting"), (failing, "failing"))
-    ]
-    if both := ends[0] & ends[1]:
-        name = list(named)[min(both)]
-        raise DeclarationError(
-            f"RewardMachine: the state {name!r} is both accepting and failing; choose one"
-        )
-    plan = Plan(
-        tuple(named), 0 if start is None else _number(start, named, "start"), [], ends[0], ends[1]
-    )
-    slots: dict[int, int] = {}
-    for pair, value in transitions.items():
-        origin, target = named[pair[0]], named[pair[1]]
-        if origin in ends[0] | ends[1]:
-            raise DeclarationError(
-                f"RewardMachine: the state {pair[0]!r} ends the task, so it has no transition; "
-                f"leave out {pair}"
-            )
-        for one in value if isinstance(value, list) else [value]:
-            event, reward = _event_and_reward(one, f"RewardMachine: transition {pair}")
-            slot = slots.get(origin, 0)
-            slots[origin] = slot + isinstance(event, Held)
-            plan.arrows.append(Arrow(origin, target, (atom_of(event, slot),), reward))
-    over = ends[0] | ends[1]
-    for state, reward in _each_step(each_step, named).items():
-        if state not in over:
-            plan.each_step[state] = reward
-    return plan
-
-
-def atom_of(event: Event, slot: int) -> Atom:
-    """Return an event as an atom; ``slot`` is that of its counter, if it needs one."""
-    return Counter(slot, event.predicate, event.steps) if isinstance(event, Held) else event
 
 
 def _event_and_reward(value: Any, where: str) -> tuple[Event, Reward]:

@@ -28,6 +28,7 @@ from skillweave.planning.predicates import (
     as_event,
     as_predicate,
     named_predicates,
+    predicate_of,
 )
 from skillweave.schema import AtLeastOne, fitted
 
@@ -90,7 +91,7 @@ class Mission(RewardMachine):
                 f"Mission: {both[0]!r} must be done and must be avoided: leave out one of them"
             )
         self.repeat = fitted(AtLeastOne | None, repeat, "Mission: repeat")
-        self._build(compile_mission(self.legs, self.avoid, self.repeat))
+        self._build(*compile_mission(self.legs, self.avoid, self.repeat))
 
     @classmethod
     def from_text(cls, text: str, predicates: Mapping[str, Any]) -> Mission:
@@ -109,7 +110,8 @@ class Mission(RewardMachine):
         Raises:
             DeclarationError: a word is unknown or out of place; the message points at it.
         """
-        legs, avoid, repeat = parse(text, named_predicates(predicates, "Mission.from_text()"))
+        words = named_predicates(predicates, "Mission.from_text()")
+        legs, avoid, repeat = _Parser(text, words).mission()
         return cls(legs, avoid=avoid, repeat=repeat)
 
 
@@ -144,10 +146,8 @@ def _needed(part: Part) -> Iterator[Predicate]:
     if isinstance(part, InOrder | AnyOrder):
         for inner in part.parts:
             yield from _needed(inner)
-    elif isinstance(part, Held):
-        yield part.predicate
-    elif isinstance(part, Predicate):
-        yield part
+    elif not isinstance(part, Choice):
+        yield predicate_of(part)
 
 
 def _several(parts: Sequence[Any], where: str) -> tuple[Part, ...]:
@@ -227,33 +227,22 @@ class _Token(NamedTuple):
     at: int
 
 
-def parse(
-    text: str, predicates: Mapping[str, Event]
-) -> tuple[Part, tuple[Predicate, ...], int | None]:
-    """Return legs, what is to be avoided, and how often the legs repeat (None: forever).
-
-    Raises:
-        DeclarationError: a word is unknown or out of place; the message points at it.
-    """
-    fitted(str, text, "a mission")
-    if len(text) > LONGEST:
-        raise DeclarationError(f"a mission has {len(text):,} characters; at most {LONGEST:,}")
-    for name in predicates:
-        if name in RESERVED:
-            raise DeclarationError(
-                f"a predicate is named {name!r}, which is a word of missions; choose another name"
-            )
-    return _Parser(text, predicates).mission()
-
-
 class _Parser:
     def __init__(self, text: str, predicates: Mapping[str, Event]) -> None:
-        self.text, self.predicates = text, predicates
+        self.text, self.predicates = fitted(str, text, "a mission"), predicates
+        if len(text) > LONGEST:
+            raise DeclarationError(f"a mission has {len(text):,} characters; at most {LONGEST:,}")
+        for name in predicates:
+            if name in RESERVED:
+                raise DeclarationError(
+                    f"a predicate is named {name!r}, which is a word of missions; choose another "
+                    "name"
+                )
         self.tokens = list(self._tokens())
         self.place = self.depth = 0
 
-    def mission(self) -> tuple[Part, tuple[Predicate, ...], int | None]:
-        """Parse the whole text."""
+    def mission(self) -> tuple[Part, list[Predicate], int | None]:
+        """Return legs, what is to be avoided, and how often the legs repeat (None: forever)."""
         legs = self.sequence()
         avoid: list[Predicate] = []
         repeat: int | None = 1
@@ -270,7 +259,7 @@ class _Parser:
                 repeat = None if self.takes("forever") else self.number(1, MOST_REPEATS)
             else:
                 self.fail("'avoid' or 'repeat' is expected after a comma")
-        return legs, tuple(avoid), repeat
+        return legs, avoid, repeat
 
     def sequence(self) -> Part:
         """Parse parts that are joined by ``then``."""
@@ -278,23 +267,23 @@ class _Parser:
 
     def choice(self) -> Part:
         """Parse parts that are joined by ``or``."""
-        first, parts = self.now, self.joined("or", self.any_order)
-        if len(parts) > MOST_TOGETHER:
-            self.fail(f"a choice has at most {MOST_TOGETHER} parts", first)
+        most = f"a choice has at most {MOST_TOGETHER} parts"
+        parts = self.joined("or", self.any_order, most)
         return parts[0] if len(parts) == 1 else Choice(tuple(parts))
 
     def any_order(self) -> Part:
         """Parse parts that are joined by ``and``."""
-        first, parts = self.now, self.joined("and", self.item)
-        if len(parts) > MOST_TOGETHER:
-            self.fail(f"at most {MOST_TOGETHER} parts can be done in any order", first)
+        most = f"at most {MOST_TOGETHER} parts can be done in any order"
+        parts = self.joined("and", self.item, most)
         return parts[0] if len(parts) == 1 else AnyOrder(tuple(parts))
 
-    def joined(self, word: str, parse: Callable[[], Part]) -> list[Part]:
-        """Parse parts with a word between them."""
-        parts = [parse()]
+    def joined(self, word: str, parse: Callable[[], Part], most: str = "") -> list[Part]:
+        """Parse parts with a word between them; ``most`` says that they are too many."""
+        first, parts = self.now, [parse()]
         while self.takes(word):
             parts.append(parse())
+        if most and len(parts) > MOST_TOGETHER:
+            self.fail(most, first)
         return parts
 
     def item(self) -> Part:

@@ -9,7 +9,7 @@ from math import prod
 from typing import Any
 
 from skillweave.errors import DeclarationError
-from skillweave.planning.machine import MOST_STATES, Arrow, Counter, Plan, atom_of
+from skillweave.planning.machine import MOST_STATES, Arrow
 from skillweave.planning.predicates import Event, Held, Predicate
 
 DONE = "done"
@@ -52,7 +52,7 @@ def sequence(parts: Sequence[Part]) -> Part:
     """
     flat: list[Part] = []
     for part in parts:
-        flat += part.parts if isinstance(part, InOrder) else [part]
+        flat += _in_order(part)
         _check_size(len(flat))
     return flat[0] if len(flat) == 1 else InOrder(tuple(flat))
 
@@ -78,29 +78,29 @@ class _Fragment:
         return len(self.arrows)
 
 
-def compile_mission(legs: Part, avoid: Sequence[Predicate], repeat: int | None) -> Plan:
-    """Return the parts of the machine of a mission."""
-    whole = sequence([legs] * (repeat or 1))
-    _check_successions(whole, again=repeat is None)
-    fragment = _fragment(whole)
-    end, names = fragment.end, _unique(fragment.waits)
-    done, failed = end, end + 1
+def compile_mission(
+    legs: Part, avoid: Sequence[Predicate], repeat: int | None
+) -> tuple[tuple[str, ...], list[Arrow], set[int], set[int]]:
+    """Return the machine of a mission: its states, arrows, accepting and failing states."""
+    parts, again = _in_order(sequence([legs] * (repeat or 1))), repeat is None
+    _check_successions(parts, again)
+    fragment = _fragment(InOrder(parts))
+    ends = [DONE] * (not again) + [FAILED] * bool(avoid)
+    names = (*_unique(fragment.waits), *ends)
+    end, failed = fragment.end, len(names) - 1
     arrows: list[Arrow] = []
     for state, leaving in enumerate(fragment.arrows):
         arrows += [Arrow(state, failed, (bad,)) for bad in avoid]
         for arrow in leaving:
             reward = fragment.worth[arrow.target] - fragment.worth[state]
-            target = 0 if repeat is None and arrow.target == end else arrow.target
-            keeps = arrow.keeps if arrow.target != end else frozenset[int]()
-            arrows.append(replace(arrow, target=target, reward=reward, keeps=keeps))
-    if repeat is None:  # the end is the start of the next round
-        if avoid:
-            arrows = [replace(a, target=end) if a.target == failed else a for a in arrows]
-            return Plan((*names, FAILED), 0, arrows, frozenset(), frozenset({end}))
-        return Plan(names, 0, arrows)
-    failing = frozenset({failed}) if avoid else frozenset[int]()
-    ends = (DONE, FAILED) if avoid else (DONE,)
-    return Plan((*names, *ends), 0, arrows, frozenset({done}), failing)
+            # The end of a mission that repeats is the start of the next round.
+            target = 0 if again and arrow.target == end else arrow.target
+            arrows.append(replace(arrow, target=target, reward=reward))
+    return names, arrows, set() if again else {end}, {failed} if avoid else set()
+
+
+def _in_order(part: Part) -> tuple[Part, ...]:
+    return part.parts if isinstance(part, InOrder) else (part,)
 
 
 def _unique(waits: Sequence[str]) -> tuple[str, ...]:
@@ -122,7 +122,7 @@ def _fragment(part: Part) -> _Fragment:
         return _in_sequence([fragments[id(p)] for p in part.parts])
     if isinstance(part, Choice | AnyOrder):
         return _together([_fragment(p) for p in part.parts], isinstance(part, Choice))
-    arrow = Arrow(0, 1, (atom_of(part, 0),))
+    arrow = Arrow(0, 1, (part,))
     return _Fragment(((arrow,),), (0.0, 1.0), (part.name,), int(isinstance(part, Held)))
 
 
@@ -155,31 +155,22 @@ def _together(parts: Sequence[_Fragment], first_ends: bool) -> _Fragment:
     """Run fragments side by side, each with counters of its own, until one or all have ended."""
     offsets = [0, *itertools.accumulate(p.slots for p in parts)]
     start = (0,) * len(parts)
-    numbers = {start: 0}
-    queue, leaving = [start], list[list[tuple[tuple[int, ...], Arrow]]]()
-    count = 0
-
-    def is_over(places: tuple[int, ...]) -> bool:
-        at_end = [at == p.end for at, p in zip(places, parts, strict=True)]
-        return any(at_end) if first_ends else all(at_end)
-
-    while len(leaving) < len(queue):
-        places = queue[len(leaving)]
+    numbers, queue, leaving = {start: 0}, [start], list[list[tuple[tuple[int, ...], Arrow]]]()
+    count, is_over = 0, any if first_ends else all
+    for places in queue:  # it grows
         count += prod(
             1 + len(p.arrows[at]) if at < p.end else 1 for at, p in zip(places, parts, strict=True)
         )
         _check_size(len(queue), count)
         leaving.append(list(_joint_arrows(places, parts, offsets)))
         for target, _ in leaving[-1]:
-            if not is_over(target) and target not in numbers:
+            over = is_over(at == p.end for at, p in zip(target, parts, strict=True))
+            if not over and target not in numbers:
                 numbers[target] = len(queue)
                 queue.append(target)
     end = len(queue)
     arrows = tuple(
-        tuple(
-            replace(a, origin=i, target=end if is_over(target) else numbers[target])
-            for target, a in some
-        )
+        tuple(replace(a, origin=i, target=numbers.get(target, end)) for target, a in some)
         for i, some in enumerate(leaving)
     )
     shares = [[p.worth[at] for at, p in zip(places, parts, strict=True)] for places in queue]
@@ -205,20 +196,20 @@ def _joint_arrows(
     combined = [c for c in itertools.product(*choices) if any(a is not None for a in c)]
     combined.sort(key=lambda c: -sum(a is not None for a in c))
     for arrows in combined:
-        atoms, keeps, target = [], set[int](), []
+        events, keeps, target = [], set[int](), []
         for i, (arrow, part) in enumerate(zip(arrows, parts, strict=True)):
             own = range(offsets[i], offsets[i] + part.slots)
             if arrow is None:
                 keeps.update(own)
                 target.append(places[i])
                 continue
-            atoms += [
-                replace(a, slot=a.slot + offsets[i]) if isinstance(a, Counter) else a
-                for a in arrow.atoms
+            events += [
+                replace(e, slot=e.slot + offsets[i]) if isinstance(e, Held) else e
+                for e in arrow.events
             ]
             keeps.update(slot + offsets[i] for slot in arrow.keeps)
             target.append(arrow.target)
-        yield tuple(target), Arrow(0, 0, tuple(atoms), 0.0, frozenset(keeps))
+        yield tuple(target), Arrow(0, 0, tuple(events), 0.0, frozenset(keeps))
 
 
 def _check_size(states: int, arrows: int = 0) -> None:
@@ -233,9 +224,8 @@ def _check_size(states: int, arrows: int = 0) -> None:
             )
 
 
-def _check_successions(whole: Part, again: bool) -> None:
+def _check_successions(parts: Sequence[Any], again: bool) -> None:
     """Raise a DeclarationError where one visit would do two legs at once."""
-    parts = list(whole.parts) if isinstance(whole, InOrder) else [whole]
     for a, b in itertools.pairwise([*parts, parts[0]] if again else parts):
         if _is_one_visit(a, b):
             raise DeclarationError(
@@ -245,7 +235,7 @@ def _check_successions(whole: Part, again: bool) -> None:
     for part in parts:
         if isinstance(part, Choice | AnyOrder):
             for inner in part.parts:
-                _check_successions(inner, again=False)
+                _check_successions(_in_order(inner), again=False)
 
 
 def _is_one_visit(a: Part, b: Part) -> bool:

@@ -19,9 +19,9 @@ from skillweave.planning.calls import CallLog
 from skillweave.planning.columns import columns_of
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph, planning_states
-from skillweave.planning.lacking import check_possible, obstacle, read_log
+from skillweave.planning.lacking import obstacle
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.mission import Task, as_task
+from skillweave.planning.mission import as_task
 from skillweave.planning.neighbors import check_features
 from skillweave.policies.files import checksum
 from skillweave.policies.plan import Near
@@ -113,7 +113,7 @@ class Planner(ReadySelector):
         self.log = fitted(CallLog, log, "Planner: log")
         self.task = as_task(task, predicates)
         self.skills, self.lengths = log.skills, log.lengths
-        if isinstance(self.task, RewardMachine) and not self.task.plan.pays:
+        if isinstance(self.task, RewardMachine) and not self.task.pays:
             raise DeclarationError(
                 "the RewardMachine pays nothing, so there is nothing to plan: give a transition a "
                 "reward, {('from', 'to'): (event, 1.0)}, or name accepting states, which then pay 1"
@@ -129,7 +129,11 @@ class Planner(ReadySelector):
         self.caution = fitted(_ToTen, caution, "Planner: caution")
         self.temperature = fitted(_ToTen, temperature, "Planner: temperature")
         self._plans: OrderedDict[bytes, Array] = OrderedDict()
-        self.over = _over(self.task, self.graph)
+        self.observed: GoalTask | None = None
+        """The task, where each observation has a goal of its own."""
+        if isinstance(self.task, GoalTask) and self.task.columns is not None:
+            self.observed = self.task
+        self.over = _over(self.observed, self.graph)
         """(E,) bool, the ends of calls after which nothing follows."""
         self.machine = self.task.at(None) if isinstance(self.task, GoalTask) else self.task
         self.states = planning_states(self.machine)
@@ -150,15 +154,15 @@ class Planner(ReadySelector):
         if isinstance(self.task, RewardMachine):
             self.plan = self._solve(self.task)
             self.obstacle = obstacle(self.task, log)
-        elif self.task.goal is not None:
-            self.plan = self._plan_of(self.task.goal)
+        elif self.observed is None:
+            self.plan = self._solve(self.task.at(self.task.goal))
 
     @cached_property
     def in_place(self) -> Planned:  # type: ignore[override]
         """The plan as data, which acts in many environments at once."""
         graph, states, worth = self.graph, self.states, self.plan
         kind: type[Planned] = Planned
-        if isinstance(self.task, GoalTask) and self.task.columns is not None:
+        if self.observed is not None:
             kind, worth = _OfObserved, np.zeros((len(graph.pieces.call), states.count), np.float32)
         acts = kind(
             *self._rule_of,
@@ -178,25 +182,19 @@ class Planner(ReadySelector):
 
     # Planning
 
-    def _solve(self, task: RewardMachine, place: Array | None = None) -> Array:
-        """Return the plan of a task; ``place`` is its goal, if it is one."""
+    def _solve(self, task: RewardMachine, near: Near | None = None, may: Any = None) -> Array:
+        """Return the plan of a task; ``near`` and ``may`` as for ``CallGraph.solve``."""
         graph = self.graph
-        readings = read_log(task, graph.log)
-        check_possible(task, readings, graph.log)
-        near, may = graph.after, graph.may
-        if place is not None and isinstance(self.task, GoalTask):
-            near, may = graph.for_goal(self.task, place)
-        judged = graph.judge(task, self.states, readings, self.gamma, self.over)
-        return graph.solve(judged, near, may, caution=self.caution)
+        near, may = (graph.after, graph.may) if near is None else (near, may)
+        return graph.solve(task, self.gamma, self.over, near, may, caution=self.caution)
 
-    def _plan_of(self, goal: Array) -> Array:
+    def _plan_of(self, task: GoalTask, goal: Array) -> Array:
         """Return the plan of a goal (G,), solved when it is first needed."""
-        assert isinstance(self.task, GoalTask)
-        key = np.asarray(goal, np.float64).tobytes()
+        key = goal.tobytes()
         if key in self._plans:
             self._plans.move_to_end(key)
         else:
-            self._plans[key] = self._solve(self.task.at(goal), goal)
+            self._plans[key] = self._solve(task.at(goal), *self.graph.for_goal(task, goal))
             if len(self._plans) > MOST_GOALS:
                 self._plans.popitem(last=False)
         return self._plans[key]
@@ -262,13 +260,13 @@ class Planner(ReadySelector):
         inside = rng.integers(log.steps, size=count // 2)
         at_ends = rng.integers(len(ends), size=count - len(inside))
         obs: Array = np.concatenate([log.next_obs[inside], ends[at_ends]])
-        if isinstance(self.task, GoalTask) and self.task.columns is not None:
-            known = np.unique(self.task.of(log.start), axis=0)
+        if (task := self.observed) is not None:
+            known = np.unique(task.of(log.start), axis=0)
             known = known[rng.permutation(len(known))[:goals]]
             for goal, rows in zip(
                 known, np.array_split(np.arange(len(obs)), len(known)), strict=True
             ):
-                obs[rows] = self.task.put(obs[rows], goal)
+                obs[rows] = task.put(obs[rows], goal)
         state = np.zeros((len(obs), 1 + machine.slots), np.int64)
         goes_on = np.flatnonzero(~(machine.accepting | machine.failing))
         state[:, 0] = rng.choice(goes_on, len(obs))
@@ -336,11 +334,11 @@ class _OfObserved(Planned):
 
     def worths(self, obs: Array) -> Iterator[tuple[Any, Array]]:
         """Yield rows of observations with one goal, and the worth of pieces for it."""
-        task = self.planner.task
-        assert isinstance(task, GoalTask)
+        task = self.planner.observed
+        assert task is not None
         unique, which = np.unique(task.of(obs), axis=0, return_inverse=True)
         for i, goal in enumerate(unique):
-            yield np.flatnonzero(which.reshape(-1) == i), self.planner._plan_of(goal)
+            yield np.flatnonzero(which.reshape(-1) == i), self.planner._plan_of(task, goal)
 
 
 def _shown_sizes(sizes: Mapping[str, int]) -> str:
@@ -362,15 +360,14 @@ def _skill_set(log: CallLog, skills: Any) -> SkillSet | None:
     return skill_set
 
 
-def _over(task: Task, graph: CallGraph) -> Array:
+def _over(observed: GoalTask | None, graph: CallGraph) -> Array:
     """Return the ends after which nothing follows, (E,) bool: where the episode terminated.
 
     An episode that ended at its own goal would go on there for another one.
     """
     over: Array = graph.terminated.copy()
-    if not isinstance(task, GoalTask) or task.columns is None:
-        return over
-    rows = np.flatnonzero(over)
-    own = task.of(graph.log.start[graph.end_call[rows]])
-    over[rows] = ~task.holds(graph.end[rows], own)
+    if observed is not None:
+        rows = np.flatnonzero(over)
+        own = observed.of(graph.log.start[graph.end_call[rows]])
+        over[rows] = ~observed.holds(graph.end[rows], own)
     return over

@@ -61,15 +61,17 @@ class Predicate:
         return f"<Predicate {self.name!r} of {self.reads}>"
 
     def __and__(self, other: Any) -> Predicate:
-        return _joined(self, other, "and", np.logical_and)
+        return self._joined(other, "and", np.logical_and)
 
     def __or__(self, other: Any) -> Predicate:
-        return _joined(self, other, "or", np.logical_or)
+        return self._joined(other, "or", np.logical_or)
 
     def __invert__(self) -> Predicate:
-        if self.reads == "obs":
-            return Predicate(lambda obs: ~self.at(obs), f"not {self.name}", "obs")
-        return Predicate(lambda step: ~self.holds(step), f"not {self.name}", "step")
+        return _of(np.logical_not, f"not {self.name}", self)
+
+    def _joined(self, other: Any, word: str, join: Callable[..., Array]) -> Predicate:
+        second = as_predicate(other, f"{self.name} {word} …")
+        return _of(join, f"({self.name} {word} {second.name})", self, second)
 
     def holds(self, step: Step) -> Array:
         """Return where the predicate is true after a ``step``, (n,) bool.
@@ -106,6 +108,8 @@ class Held:
 
     predicate: Predicate
     steps: int
+    slot: int = 0
+    """In a machine, the column of its counter in a task's state, after the first."""
 
     @property
     def name(self) -> str:
@@ -128,6 +132,11 @@ class Held:
 
 
 Event = Predicate | Held
+
+
+def predicate_of(event: Event) -> Predicate:
+    """Return the predicate that an event reads."""
+    return event.predicate if isinstance(event, Held) else event
 
 
 @checked_names
@@ -205,14 +214,11 @@ def successes(skills: Iterable[Skill]) -> dict[str, Predicate]:
     }
 
 
-def _joined(
-    a: Predicate, other: Any, word: str, join: Callable[[Array, Array], Array]
-) -> Predicate:
-    b = as_predicate(other, f"{a.name} {word} …")
-    name = f"({a.name} {word} {b.name})"
-    if a.reads == b.reads == "obs":
-        return Predicate(lambda obs: join(a.at(obs), b.at(obs)), name, "obs")
-    return Predicate(lambda step: join(a.holds(step), b.holds(step)), name, "step")
+def _of(join: Callable[..., Array], name: str, *parts: Predicate) -> Predicate:
+    """Return the predicate that joins what the ``parts`` answer."""
+    reads: Reads = "obs" if all(part.reads == "obs" for part in parts) else "step"
+    ask = Predicate.at if reads == "obs" else Predicate.holds
+    return Predicate(lambda x: join(*(ask(part, x) for part in parts)), name, reads)
 
 
 def _hint(error: SkillError) -> str | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -37,22 +37,6 @@ from skillweave.skills.goal_spaces import blank_choices
 from skillweave.skills.skill_set import SkillSet, acting_policy, in_place, skills_below
 from skillweave.spaces import same_space
 from skillweave.types import Array
-
-
-@runtime_checkable
-class LearnsFromCalls(Protocol):
-    """A selector that plans again on the calls that have been recorded."""
-
-    every: int
-    """Steps after which it plans again."""
-
-    def begin(self, choices: int) -> None:
-        """Prepare for a recording; ``choices``: of a selector, skills times lengths."""
-        ...
-
-    def learn(self, log: CallLog) -> None:
-        """Plan on the calls so far."""
-        ...
 
 
 class RandomChoice(InPlace):
@@ -135,8 +119,9 @@ def with_returns(
             f"record_calls(): {short(skills)} has no skills; give a run's policy, run.policy"
         )
     fitted(Sequence[str], info, "info")
-    if isinstance(choose, str) and choose == "explore":
-        choose = Explorer()
+    if isinstance(choose, str):
+        known = {"random": RandomChoice(skill_set.choices), "explore": Explorer()}
+        choose = known.get(choose, choose)
     skill_set = replace(skill_set, interruption=None)  # it belongs to a selector that is left out
     spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
     seeds = Seeds(seed) / "calls"
@@ -148,11 +133,7 @@ def with_returns(
             skill_set, spaces, num_envs, info=info, own_rewards=own_rewards, spec=spec
         )
         policy = acting_policy(skill_set, selector)
-        rng = (seeds / "choices").numpy()
-        sampled = isinstance(choose, RandomChoice) or (
-            isinstance(choose, str) and choose == "random"
-        )
-        turn = Turn(World(rng), greedy=not sampled)
+        turn = Turn(World((seeds / "choices").numpy()), greedy=not isinstance(choose, RandomChoice))
         played: list[int] = []
         # Without `keep` an interrupt may be one of the training around.
         until, stops = (nullcontext(), bool) if keep is None else (deferred("now"), requested)
@@ -204,19 +185,17 @@ class WithDrawnGoals(Around):
             mine = np.flatnonzero(skill == i)
             if len(mine):
                 choice[GOAL][name][mine] = goals.draw(obs[mine], rng)
-        spaces = {goals.skill.name: goals.space for _, goals in self._goals.values()}
-        for name, (at, numbers) in again.items():
-            choice[GOAL][name][at] = spaces[name].of_numbers(numbers)
+            if name in again:
+                at, numbers = again[name]
+                choice[GOAL][name][at] = goals.space.of_numbers(numbers)
         return choice
 
 
 def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
     names, choices = tuple(s.name for s in skills.skills), skills.choice_space
-    if isinstance(choose, str) and choose == "random":
-        choose = RandomChoice(skills.choices)
-    if isinstance(choose, LearnsFromCalls) and not isinstance(choose, type):
+    if isinstance(choose, Explorer):
         choose.begin(skills.choices)
-    if isinstance(choose, InPlace | LearnsFromCalls) and not isinstance(choose, type):
+    if isinstance(choose, InPlace):
         return WithDrawnGoals(choose, skills, choices) if goals_in(skills) else choose
     if isinstance(choose, ReadySelector) or not hasattr(choose, "act"):
         if (ready := ready_selector(choose, names)) is not None:
@@ -290,7 +269,7 @@ def _play(
                 age[over] = 0
             if made >= steps:
                 rows = rows[memory["end"][rows] == CallEnd.RUNNING]
-            elif isinstance(choose, LearnsFromCalls) and made - planned >= choose.every:
+            elif isinstance(choose, Explorer) and made - planned >= choose.every:
                 planned = made
                 feed.flush()
                 if recorder.calls:

@@ -21,7 +21,7 @@ from skillweave.errors import DeclarationError
 from skillweave.experience.views import OwnSteps, call_successes, info_numbers_of
 from skillweave.experience.writer import TraceWriter
 from skillweave.planning.calls import CallLog, seen_places, skill_checksums, skill_code
-from skillweave.planning.columns import GOAL, PER_CALL, PER_STEP, call_fields
+from skillweave.planning.columns import GOAL, call_fields, fields_of
 from skillweave.policies.core import LIMIT, RUNNING
 from skillweave.runs.user_code import Texts, environment_texts
 from skillweave.skills.base import RecordedSkill
@@ -133,7 +133,10 @@ class Recorder:
         self._latest = np.zeros(n, row)  # the latest call of each environment
         self._latest["number"] = -1
         self._open, self._won = np.zeros(n, bool), np.zeros(n, bool)  # it runs; success() is true
-        self._episode, self._order = np.full(n, -1), np.zeros(n, np.int64)
+        self._episode, self._count = np.full(n, -1), np.zeros(n, np.int64)
+        # The calls of an environment before its episode. Where that was open when the recording
+        # began, its first calls are unknown, so the next one is number 1 in it.
+        self._first = np.full(n, -1)
         self._episodes = self._calls = 0
         self._parts: deque[_Part] = deque()
         self._last: tuple[Trace, Array] | None = None  # the last row of the trace before
@@ -207,19 +210,15 @@ class Recorder:
             starts: (T, k) bool, a call starts with it.
             ids: (k,) the environments.
         """
-        # Of an episode that was open when the recording began, the first calls are unknown.
-        late = (self._episode[ids] < 0) & ~begins[0]
-        self._order[ids[late]] = 1
-        count = np.cumsum(starts, axis=0)
-        began = np.maximum.accumulate(np.where(begins, np.arange(len(begins))[:, None], -1), axis=0)
-        before = (count - starts)[np.maximum(began, 0), np.arange(len(ids))]
-        order = count - 1 + np.where(began < 0, self._order[ids], -before)
+        before = self._count[ids] + np.cumsum(starts, axis=0) - starts
+        first = _running(np.where(begins, before, -1), self._first[ids])
         begins = begins.copy()
-        begins[0] |= late
+        begins[0] |= self._episode[ids] < 0
         episode = _numbered(begins, self._episode[ids], self._episodes)
-        self._episode[ids], self._order[ids] = episode[-1], order[-1] + 1
+        self._episode[ids], self._first[ids] = episode[-1], first[-1]
+        self._count[ids] = before[-1] + starts[-1]
         self._episodes += int(begins.sum())
-        return episode, order
+        return episode, before - first
 
     def rows(self) -> Array:
         """Return the calls that are kept and have ended, (C,), in the order of their starts.
@@ -239,9 +238,10 @@ class Recorder:
         rows, steps, skills = self.rows(), self._joined(), self.skills
         inside = np.flatnonzero(np.isin(steps["call"], rows["number"]))
         inside = inside[np.argsort(steps["call"][inside], kind="stable")]
-        steps = {name: x[inside] if len(x) else x for name, x in steps.items()}
-        columns = {k: np.ascontiguousarray(rows[k]) for k in rows.dtype.names or ()}
-        logged: dict[str, Any] = {k: columns[k] for k in PER_CALL} | {k: steps[k] for k in PER_STEP}
+        steps = {k: x[inside] if len(x) else x for k, x in steps.items() if k != "call"}
+        kept = [name for name in rows.dtype.names or () if name not in dict(SUMS)]
+        columns = {name: np.ascontiguousarray(rows[name]) for name in kept} | steps
+        columns["offset"] = np.concatenate([[0], np.cumsum(rows["steps"])])
         log = CallLog(
             tuple(s.name for s in skills.skills),
             skills.lengths,
@@ -251,10 +251,7 @@ class Recorder:
             tuple(not hasattr(p, "start") or bool(p.start(1)) for p in skills.policies),
             tuple(skill.defines("success") for skill in skills.skills),
             *self.spaces,
-            **logged,
-            offset=np.concatenate([[0], np.cumsum(rows["steps"])]),
-            info={key: steps[INFO + key] for key in self.info},
-            goals={name: columns[GOAL + name] for name in self.goals},
+            **fields_of(columns),
             code=self._environment | skill_code(skills),
         )
         return log if self.latest is None else log.latest(self.latest)
@@ -484,8 +481,13 @@ def _numbered(starts: Array, latest: Array, count: int) -> Array:
     """
     numbers = np.full(starts.shape, -1)
     numbers[starts] = count + np.arange(starts.sum())
-    numbers[0] = np.maximum(numbers[0], latest)
-    return np.maximum.accumulate(numbers, axis=0)
+    return _running(numbers, latest)
+
+
+def _running(values: Array, before: Array) -> Array:
+    """Return the largest of ``before`` (k,) and the values (T, k) so far, which it may change."""
+    values[0] = np.maximum(values[0], before)
+    return np.maximum.accumulate(values, axis=0)
 
 
 def is_endless(skills: SkillSet, i: int) -> bool:

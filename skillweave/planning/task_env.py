@@ -38,8 +38,7 @@ class OwnView:
         if self._parts is None:
             return np.ascontiguousarray(obs[OBSERVATION])
         own = np.empty(len(obs), obs_dtype(self.space))
-        for part in self._parts:
-            own[part] = obs[part]
+        own[:] = obs[[*self._parts]]
         return own
 
     def joined(self, obs: Array, state: Array) -> Array:
@@ -47,10 +46,7 @@ class OwnView:
         whole = _with_task(self.space, gym.spaces.Box(0.0, 1.0, state.shape[1:], np.float32))
         joined = np.empty(len(obs), obs_dtype(whole))
         joined[TASK] = state
-        if self._parts is None:
-            joined[OBSERVATION] = obs
-        for part in self._parts or ():
-            joined[part] = obs[part]
+        joined[OBSERVATION if self._parts is None else [*self._parts]] = obs
         return joined
 
     def step(self, step: Step) -> Step:
@@ -94,14 +90,12 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
         self._own, self._observes = env.observation_space, observe
         if observe:
             self.observation_space = _with_task(self._own, self.machine.observation_space)
-        self._state, self._elapsed = self.machine.start(1), 0
-        self._obs = self._batch_of_one(None)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Reset the environment and the task."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._state, self._elapsed = self.machine.start(1), 0
-        self._obs = self._batch_of_one(obs)
+        self._obs = _batch_of_one(self._own, obs)
         return self._seen(obs), info
 
     def step(self, action: Any) -> Any:
@@ -110,7 +104,7 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
         self._elapsed += 1
         if terminated or truncated:
             obs, info = last_observation(obs, info, self.env)
-        after = self._batch_of_one(obs)
+        after = _batch_of_one(self._own, obs)
         step = Step(
             obs=self._obs,
             action=self._packed(action),
@@ -148,19 +142,14 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
     def _packed(self, action: Any) -> Array:
         """Return an action as skills see it, (1, *action_shape)."""
         space = self.action_space
-        if parts(space) is None:
-            return np.asarray(action)[None]
-        batch = np.zeros(1, obs_dtype(space))
-        put_observation(space, batch, 0, action)
-        return batch
+        return np.asarray(action)[None] if parts(space) is None else _batch_of_one(space, action)
 
-    def _batch_of_one(self, obs: Any) -> Array:
-        """Return an observation as skills see it, (1, *obs_shape)."""
-        space = self._own
-        batch = np.zeros((1, *obs_shape(space)), obs_dtype(space))
-        if obs is not None:
-            put_observation(space, batch, 0, obs)
-        return batch
+
+def _batch_of_one(space: gym.Space[Any], value: Any) -> Array:
+    """Return a value of a space as skills see it, (1, …)."""
+    batch = np.zeros((1, *obs_shape(space)), obs_dtype(space))
+    put_observation(space, batch, 0, value)
+    return batch
 
 
 def _with_task(space: gym.Space[Any], task: gym.Space[Any]) -> gym.spaces.Dict:

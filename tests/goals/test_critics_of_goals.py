@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from small_runs import goes_on
-from worlds import SMALL, SPACES, Point, Rest, declared, go_to
+from worlds import OFTEN, SELECTOR, SMALL, SPACES, Point, Rest, declared, go_to
 
 import skillweave as sw
 from skillweave._internal.seeding import Seeds
@@ -22,8 +22,6 @@ from skillweave.skills.goals import goals_of
 from skillweave.skills.skill_set import SkillSet, hierarchy_of
 from skillweave.types import Step
 
-SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)
-OFTEN = sw.TrainDefaults(checkpoint_every=60)
 TOGETHER: Any = {"selector": SELECTOR, "learn": "together", "train_defaults": OFTEN}
 
 
@@ -112,10 +110,10 @@ def test_interruption_with_goals_is_trained_and_resumed(learn, space, tmp_path):
     assert again.returns == before.returns
 
 
-def test_a_skill_with_goals_follows_the_task_too(tmp_path):
+def test_a_skill_with_goals_follows_the_task_too():
     def trained(weight):
         hierarchy = declared([go_to(task_weight=weight), Rest()], steps=500, **TOGETHER)
-        run = hierarchy.train(tmp_path / str(weight), seed=1, quiet=True)
+        run = hierarchy.train(seed=1, quiet=True)
         return run.policy.skills.policies[0].weights
 
     own, both, again = (trained(weight) for weight in (0.0, 2.0, None))
@@ -123,14 +121,14 @@ def test_a_skill_with_goals_follows_the_task_too(tmp_path):
     assert any(not torch.equal(own[k], again[k]) for k in own)  # Together.task_weight
 
 
-def test_a_network_that_sees_a_part_has_a_critic_that_sees_goals_too(tmp_path):
+def test_a_network_that_sees_a_part_has_a_critic_that_sees_goals_too():
     selector = sw.PPO(num_envs=4, n_steps=64, network=sw.Network(hidden=(8,), sees=(1,)))
     how = TOGETHER | {"selector": selector, "together": sw.Together(interrupt=True)}
-    run = declared([Rest(), go_to()], steps=300, **how).train(tmp_path / "run", quiet=True)
+    run = declared([Rest(), go_to()], steps=300, **how).train(quiet=True)
     assert run.policy.skills.interruption.critic.algorithm.config.network.sees == (1, 2, 3)
 
 
-def test_keys_lead_to_the_same_parts_beside_goals(tmp_path):
+def test_keys_lead_to_the_same_parts_beside_goals():
     selector = sw.PPO(num_envs=4, n_steps=64, network=sw.Network(hidden=(8,), sees="place"))
     skill = sw.PPO(
         num_envs=4, n_steps=64, network=sw.Network((8,), sees=("observation.place", "goal"))
@@ -141,7 +139,7 @@ def test_keys_lead_to_the_same_parts_beside_goals(tmp_path):
         env = sw.EnvSpec(lambda: Point(as_dict=True), workers=1)
         return declared([Rest(), go_to(algorithm=skill)], env=env, steps=300, **how)
 
-    run = made().train(tmp_path / "run", quiet=True)
+    run = made().train(quiet=True)
     critic = run.policy.skills.interruption.critic.algorithm.config.network
     assert critic.sees == ("observation.place", 2, 3)
     assert made().load(run.path).evaluate(3).returns == run.evaluate(3).returns

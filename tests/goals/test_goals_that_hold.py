@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,9 +51,9 @@ class Middle(Point):
         return self._obs(), {}
 
 
-def test_a_goal_that_holds_is_no_decision_of_a_selector_that_learns(tmp_path: Path):
+def test_a_goal_that_holds_is_no_decision_of_a_selector_that_learns():
     stays = go_to("number", policy=lambda obs, goal: 0 * obs, max_steps=2)
     hierarchy = declared([stays], env=Middle, selector=ON, steps=128)
-    run = hierarchy.train(tmp_path / "run", log_calls=100, quiet=True)
+    run = hierarchy.train(log_calls=100, quiet=True)
     assert (run.calls.goals["go_to"] == 3).all()
     assert (run.calls.tau == 2).all()

@@ -7,16 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 from small_runs import goes_on
-from worlds import SMALL, SPACES, GoTo, Rest, aim_of, declared, go_to
+from worlds import OFTEN, SELECTOR, SPACES, GoTo, Rest, aim_of, declared, go_to
 
 import skillweave as sw
 from skillweave.errors import RunError
 from skillweave.experience.collector import Collector
 from skillweave.experience.learners import Calling
 from skillweave.skills.goal_spaces import with_goal
-
-SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)
-OFTEN = sw.TrainDefaults(checkpoint_every=60)
 
 
 class Walk(GoTo):
@@ -45,10 +42,10 @@ def far(inner: Any, space: str = "box", **attributes: Any) -> sw.Skill:
     return type("Far", (GoTo,), methods | attributes)()
 
 
-def test_a_rule_passes_the_goal_on(tmp_path):
+def test_a_rule_passes_the_goal_on():
     inner = declared([Walk(), Rest()], selector=passes_on, name="inner", call_steps=3)
     hierarchy = declared([far(inner), Rest()], selector=outer_goals, call_steps=9)
-    run = hierarchy.train(tmp_path / "run", quiet=True)
+    run = hierarchy.train(quiet=True)
     report = run.evaluate(4)
     assert report.skills["far"].success_rate == 1.0
     assert report.skills["far/walk"].calls >= report.skills["far"].calls
@@ -86,7 +83,7 @@ def test_it_learns_and_goes_on_bit_for_bit(learn, space, tmp_path):
     assert sw.load(run.path, hierarchy()).evaluate(3).returns == before.returns
 
 
-def test_its_selector_learns_to_use_the_goal(tmp_path):
+def test_its_selector_learns_to_use_the_goal():
     """The inner selector alone can reach a goal; what it was never told, it could not."""
 
     rows = []
@@ -103,7 +100,7 @@ def test_its_selector_learns_to_use_the_goal(tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Collector, "_views", views)
         declared([far(inner), Rest()], selector=outer_goals, steps=None, call_steps=9).train(
-            tmp_path / "run", quiet=True
+            quiet=True
         )
     goals = set()
     for obs, after, terminated, mine in rows:
@@ -114,12 +111,12 @@ def test_its_selector_learns_to_use_the_goal(tmp_path):
     assert len(goals) > 5
 
 
-def test_other_goals_are_refused(tmp_path):
+def test_other_goals_are_refused():
     inner = declared([Walk(), Rest()], selector=SELECTOR, name="inner", call_steps=3, steps=200)
 
     def hierarchy(space):
         return declared([far(inner, space), Rest()], selector=outer_goals, call_steps=9)
 
-    hierarchy("box").train(tmp_path / "run", quiet=True)
+    run = hierarchy("box").train(quiet=True)
     with pytest.raises(RunError, match=r"'far'.*was trained for goals of Box"):
-        sw.load(tmp_path / "run", hierarchy("unbounded"))
+        sw.load(run.path, hierarchy("unbounded"))

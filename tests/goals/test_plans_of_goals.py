@@ -10,14 +10,13 @@ import pytest
 from goals.test_calls_of_goals import ready
 from goals.worlds import SPACES, Point, Rest, declared, go_to, place_of
 from planning.logs import log_of
-from planning.steps import at, step_to
+from planning.steps import assert_not_repeated, at
 
 import skillweave as sw
 from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.planning import CallLog, Explorer, Mission, Planner, Predicate
 from skillweave.planning.graph import CallGraph
 from skillweave.policies.spaces import space_of
-from skillweave.skills import LastCall
 from skillweave.skills.goal_spaces import choice_space, draw_from
 from skillweave.skills.goals import goals_of
 
@@ -130,19 +129,7 @@ def test_a_goal_that_failed_is_not_repeated_forever() -> None:
     """The log says that goals above lead to 3; now there is a wall."""
     log = jumps((0, 10), np.repeat(np.arange(11), 3))
     planner = bound(Planner(log, at(9), neighbors=1, gamma=GAMMA), LINE)
-    memory, obs, aims = planner.start(1), np.float32([[2]]), []
-    for _ in range(6):
-        choice, memory = planner.act(memory, obs)
-        aims.append(float(choice["goal"]["go"][0, 0]))
-        before, obs = obs, np.float32([[2]]) if aims[-1] > 2 else np.float32([[0]])
-        last = LastCall(np.zeros(1, int), np.full(1, 2, np.int8), np.zeros(1, bool))
-        for _ in range(3):
-            memory = planner.watch(memory, step_to(obs, before), last)
-        if aims[-1] == 0:
-            break
-    assert aims[0] == 10
-    assert aims[-1] == 0
-    assert len(aims) <= 4
+    assert_not_repeated(planner, lambda choice: choice["goal"]["go"][:, 0] > 2)
 
 
 @pytest.mark.slow
@@ -157,12 +144,12 @@ def test_a_mission_of_places_that_no_training_saw() -> None:
 
 
 @pytest.mark.slow
-def test_a_planner_is_declared_as_a_selector(tmp_path: Any) -> None:
+def test_a_planner_is_declared_as_a_selector() -> None:
     run = ready()
     log = run.log_calls(1_500, num_envs=8)
     skills = run.hierarchy.skills
     other = declared(skills, selector=Planner(log, near(1.4, 0.3)))
-    played = other.train(tmp_path / "run", quiet=True)
+    played = other.train(quiet=True)
     calls = played.log_calls(300, choose=played.policy.selector, num_envs=2)
     there = near(1.4, 0.3).at(calls.next_obs)
     arrived = [there[calls.episode[calls.owner] == e].any() for e in np.unique(calls.episode)]
@@ -170,14 +157,14 @@ def test_a_planner_is_declared_as_a_selector(tmp_path: Any) -> None:
     assert np.mean(arrived) >= 0.9
 
 
-def test_another_log_s_goals_are_refused(tmp_path: Any) -> None:
+def test_another_log_s_goals_are_refused() -> None:
     log = ready().log_calls(300, num_envs=4)
     run = ready("number")
     with pytest.raises(RunError, match="changed since the log"):
         run.plan(near(1.4, 0.3), log)
     other = declared(run.hierarchy.skills, selector=Planner(log, near(1.4, 0.3)))
     with pytest.raises(RunError, match=r"goals of go_to \(2 numbers\).*go_to \(1 number\)"):
-        other.train(tmp_path / "run", quiet=True)
+        other.train(quiet=True)
 
 
 def test_a_guide_of_one_skill_with_goals_is_refused() -> None:
@@ -255,22 +242,22 @@ def test_a_skill_with_goals_that_was_never_called_is_not_chosen() -> None:
 
 
 @pytest.mark.slow
-def test_a_trained_selector_starts_from_a_plan_with_goals(tmp_path: Any) -> None:
+def test_a_trained_selector_starts_from_a_plan_with_goals() -> None:
     run = ready()
     log = run.log_calls(3_000, num_envs=8, seed=1)
     planned = run.plan(near(1.4, 0.3), log)
     config = sw.PPO(num_envs=2, n_steps=16, batch_size=8, update_epochs=1, learning_rate=1e-9)
     declared_again = planned.with_selector(config, steps=32)
-    trained = declared_again.train(tmp_path / "run", quiet=True)
+    trained = declared_again.train(quiet=True)
     rate = trained.evaluate(20, quiet=True).success_rate
     untaught = planned.with_selector(config, steps=32)
     untaught._starts = type(untaught)._starts
-    other = untaught.train(tmp_path / "other", quiet=True).evaluate(20, quiet=True).success_rate
+    other = untaught.train(quiet=True).evaluate(20, quiet=True).success_rate
     assert rate is not None
     assert other is not None
     assert rate >= 0.6
     assert other <= 0.2
-    again = declared_again.load(tmp_path / "run")
+    again = declared_again.load(trained.path)
     assert again.evaluate(3, quiet=True).returns == trained.evaluate(3, quiet=True).returns
 
 

@@ -6,14 +6,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from small_runs import goes_on
-from worlds import ON, SMALL, SPACES, Point, Rest, declared, go_to
+from worlds import OFF, OFTEN, ON, SELECTOR, SMALL, SPACES, Point, Rest, declared, go_to
 
 import skillweave as sw
 from skillweave.errors import DeclarationError, PolicyError, SkillError
-from skillweave.hierarchy.options import OptionsEnv
 
-SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)
-OFTEN = sw.TrainDefaults(checkpoint_every=60)
 HERE = (0.5, -0.5)
 BYTES = gym.spaces.Box(0, 255, (2,), np.uint8)
 BITS = gym.spaces.MultiBinary(2)
@@ -43,16 +40,16 @@ READY = {
 
 @pytest.mark.parametrize("name", READY)
 @pytest.mark.parametrize("learn", ["apart", "together"])
-def test_ready_selectors_give_goals(name, learn, tmp_path):
+def test_ready_selectors_give_goals(name, learn):
     skills = [go_to(), Rest()]
-    run = declared(skills, selector=READY[name], learn=learn).train(tmp_path / "run", quiet=True)
+    run = declared(skills, selector=READY[name], learn=learn).train(quiet=True)
     report = run.evaluate(4)
     assert report.skills["go_to"].calls > 0
     again = declared([go_to(), Rest()], selector=READY[name], learn=learn)
-    assert sw.load(tmp_path / "run", again).evaluate(4).returns == report.returns
+    assert sw.load(run.path, again).evaluate(4).returns == report.returns
 
 
-def test_goals_are_those_that_the_selector_gave(tmp_path):
+def test_goals_are_those_that_the_selector_gave():
     seen = []
 
     class Looks(Rest):
@@ -64,7 +61,7 @@ def test_goals_are_those_that_the_selector_gave(tmp_path):
             return np.zeros((len(obs), 2), np.float32)
 
     hierarchy = declared([Looks()], selector=lambda obs: (np.full(len(obs), "go_to"), obs / 4))
-    run = hierarchy.train(tmp_path / "run", quiet=True)
+    run = hierarchy.train(quiet=True)
     seen.clear()
     env = Point()
     obs, _ = env.reset(seed=1)
@@ -80,14 +77,12 @@ SPACE_NAMES = [name for name in SPACES if name != "picture"]
 
 @pytest.mark.parametrize("space", SPACE_NAMES)
 @pytest.mark.parametrize("learn", ["apart", "together", "apart, then together"])
-def test_a_selector_learns_skill_and_goal(space, learn, tmp_path):
+def test_a_selector_learns_skill_and_goal(space, learn):
     skills = [Rest(), go_to(space)]
-    run = declared(skills, selector=SELECTOR, learn=learn, steps=700).train(
-        tmp_path / "run", quiet=True
-    )
+    run = declared(skills, selector=SELECTOR, learn=learn, steps=700).train(quiet=True)
     report = run.evaluate(3)
     again = declared([Rest(), go_to(space)], selector=SELECTOR, learn=learn)
-    assert sw.load(tmp_path / "run", again).evaluate(3).returns == report.returns
+    assert sw.load(run.path, again).evaluate(3).returns == report.returns
     run.evaluate(3, deterministic=False)
 
 
@@ -115,13 +110,10 @@ def test_skills_with_goals_inside(learn, tmp_path):
     assert run.evaluate(2, skill="inner/go_to").skills["inner/go_to"].calls == 2
 
 
-def test_chosen_lengths_and_goals(tmp_path):
+def test_chosen_lengths_and_goals():
     how = {"selector": SELECTOR, "call_steps": sw.Lengths(2, 4), "steps": 700}
-    run = declared([Rest(), go_to()], **how).train(tmp_path / "run", quiet=True)
+    run = declared([Rest(), go_to()], **how).train(quiet=True)
     run.evaluate(3, deterministic=False)
-
-
-OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}
 
 
 @pytest.mark.parametrize("space", ["number", "numbers", "bits", "whole"])
@@ -145,7 +137,7 @@ def test_a_selector_with_values_chooses_discrete_goals(selector, space, tmp_path
 
     whole = goes_on(hierarchy, tmp_path, 4)
     assert sw.load(whole.path, hierarchy()).evaluate(3).returns == whole.evaluate(3).returns
-    hierarchy("together").train(tmp_path / "together", seed=3, quiet=True)
+    hierarchy("together").train(seed=3, quiet=True)
 
 
 @pytest.mark.parametrize(
@@ -175,48 +167,39 @@ def test_algorithms_say_which_goals_they_cannot_choose(selector, space, says):
         (sw.tree.Sequence(("go_to", (1.0, 2.0, 3.0))), "gave goals of shape"),
     ],
 )
-def test_a_goal_that_is_not_right(selector, says, tmp_path):
+def test_a_goal_that_is_not_right(selector, says):
     with pytest.raises(SkillError, match=says):
-        declared([go_to(), Rest()], selector=selector).train(tmp_path / "run", quiet=True).evaluate(
-            2
-        )
+        declared([go_to(), Rest()], selector=selector).train(quiet=True).evaluate(2)
 
 
-def test_goals_for_skills_without_goals(tmp_path):
+def test_goals_for_skills_without_goals():
     rule = lambda obs: (np.full(len(obs), "rest"), obs)  # noqa: E731
     with pytest.raises(SkillError, match="returned skills and goals, but no skill"):
         declared([Rest()], selector=rule).check_spaces()
-    agent = sw.train_agent(Point, ON, 200, tmp_path / "agent", quiet=True)
+    agent = sw.train_agent(Point, ON, 200, quiet=True)
     with pytest.raises(PolicyError, match="has goals, but its policy observes Box"):
         declared([go_to(policy=agent.policy)]).check_spaces()
 
 
-def test_a_goal_out_of_reach_is_clipped(tmp_path):
+def test_a_goal_out_of_reach_is_clipped():
     def nearest(self, obs, goal):
         return np.clip(goal, -0.3, 0.3)
 
     skill = go_to(clip_goal=nearest)
     rule = lambda obs: (np.full(len(obs), "go_to"), np.full((len(obs), 2), 5.0))  # noqa: E731
-    run = declared([skill], selector=rule).train(tmp_path / "run", quiet=True)
+    run = declared([skill], selector=rule).train(quiet=True)
     player = run.player()
     player.act(np.zeros(2, np.float32))
     assert np.allclose(player.memory["goal"]["0"], 0.3)
 
 
-def test_an_environment_of_options_takes_goals(tmp_path):
-    run = declared([Rest(), go_to()], selector=SELECTOR, steps=700).train(
-        tmp_path / "run", quiet=True
-    )
-    engine = sw.EnvSpec(Point, engine="sync")
-    from skillweave.envs.make import make_engine
-
-    env = OptionsEnv(make_engine(engine, 3), run.policy.skills, gamma=0.9)
+def test_an_environment_of_options_takes_goals():
+    env = sw.make_options_env(declared([Rest(), go_to()]).train(quiet=True), 3, 0.9)
     env.reset(seed=0)
     env.action_space.seed(0)
     for _ in range(5):
-        obs, _reward, *_ = env.step(env.action_space.sample())
+        obs, *_ = env.step(env.action_space.sample())
     assert obs.shape == (3, 2)
-    env.close()
 
 
 @pytest.mark.parametrize(
@@ -238,19 +221,14 @@ def test_an_environment_of_options_says_what_is_wrong(actions, says):
         env.step(actions)
 
 
-def test_an_environment_of_options_does_not_change_goals(tmp_path):
-    from skillweave.envs.make import make_engine
-
+def test_an_environment_of_options_does_not_change_goals():
     skill = go_to()
     type(skill).goal_space = BYTES
-    rule = sw.tree.Sequence(("go_to", (1, 2)))
-    run = declared([skill, Rest()], selector=rule).train(tmp_path / "run", quiet=True)
-    engine = make_engine(sw.EnvSpec(Point, engine="sync"), 2)
-    env = OptionsEnv(engine, run.policy.skills, gamma=0.9)
+    run = declared([skill, Rest()], selector=sw.tree.Sequence(("go_to", (1, 2)))).train(quiet=True)
+    env = sw.make_options_env(run, 2, 0.9)
     env.reset(seed=0)
     with pytest.raises(SkillError, match=r"gave the goal \[300, 1\], which is out of goal_space"):
         env.step({"skill": np.zeros(2, int), "goal": {"go_to": np.array([[1, 1], [300, 1]])}})
-    env.close()
 
 
 def test_what_goals_are_not_for_yet():
@@ -269,7 +247,7 @@ def test_spaces_of_goals():
         declared([type("GoTo", (sw.Skill,), {"goal_space": graph})()]).check_spaces()
 
 
-def evaluated(selector, space, tmp_path):
+def evaluated(selector, space):
     """Evaluate a selector of a skill with goals of a space."""
     skill = go_to()
     type(skill).goal_space = space
@@ -278,7 +256,7 @@ def evaluated(selector, space, tmp_path):
         type(skill).termination = lambda self, step: step.goal["at"].sum(1) > 9
         type(skill).success = lambda self, step: step.goal["at"].sum(1) > 9
     hierarchy = declared([skill, Rest()], selector=selector)
-    return hierarchy.train(tmp_path / "run", quiet=True).evaluate(2)
+    return hierarchy.train(quiet=True).evaluate(2)
 
 
 @pytest.mark.parametrize(
@@ -286,7 +264,7 @@ def evaluated(selector, space, tmp_path):
     [((300, 300), BYTES), ((-1, 7), BYTES), ((257, 0), BITS), ((3, 2**40), SPACES["numbers"])],
 )
 @pytest.mark.parametrize("form", ["function", "automaton", "tree", "by function"])
-def test_whole_goals_do_not_wrap_around(goal, space, form, tmp_path):
+def test_whole_goals_do_not_wrap_around(goal, space, form):
     selector = {
         "function": lambda obs: (["go_to"] * len(obs), np.tile(goal, (len(obs), 1))),
         "automaton": sw.Automaton({"a": ("go_to", goal)}, {}),
@@ -295,7 +273,7 @@ def test_whole_goals_do_not_wrap_around(goal, space, form, tmp_path):
     }[form]
     says = rf"gave the goal \[{goal[0]}, {goal[1]}\], which is out of goal_space .*skill 'go_to'"
     with pytest.raises(SkillError, match=says):
-        evaluated(selector, space, tmp_path)
+        evaluated(selector, space)
 
 
 @pytest.mark.parametrize(
@@ -306,19 +284,19 @@ def test_whole_goals_do_not_wrap_around(goal, space, form, tmp_path):
         ((1, 2, 3), "gave goals of shape"),
     ],
 )
-def test_parts_of_goals_do_not_change(byte, says, tmp_path):
+def test_parts_of_goals_do_not_change(byte, says):
     selector = sw.tree.Sequence(("go_to", {"at": (0.5, 0.5), "byte": byte}))
     with pytest.raises(SkillError, match=says):
-        evaluated(selector, NESTED, tmp_path)
+        evaluated(selector, NESTED)
 
 
-def test_goals_of_other_rows_may_be_anything(tmp_path):
+def test_goals_of_other_rows_may_be_anything():
     def rule(obs):
         goes = obs[:, 0] > 0
         goals = np.where(goes[:, None], [200, 3], -1)
         return np.where(goes, "go_to", "rest"), goals
 
-    assert len(evaluated(rule, BYTES, tmp_path).returns) == 2
+    assert len(evaluated(rule, BYTES).returns) == 2
 
 
 @pytest.mark.parametrize(
@@ -331,9 +309,9 @@ def test_goals_of_other_rows_may_be_anything(tmp_path):
         (sw.Automaton({"a": ("go_to", lambda obs: None)}, {}), "returned None, but goals"),
     ],
 )
-def test_goals_that_are_no_arrays(selector, says, tmp_path):
+def test_goals_that_are_no_arrays(selector, says):
     with pytest.raises(SkillError, match=says):
-        evaluated(selector, SPACES["box"], tmp_path)
+        evaluated(selector, SPACES["box"])
 
 
 def test_goals_of_unequal_shapes():
@@ -353,13 +331,13 @@ def rows_of(goal, n):
 @pytest.mark.parametrize(
     "goals", [lambda n: rows_of(AT, n), lambda n: {"go_to": rows_of(AT, n)}], ids=["bare", "named"]
 )
-def test_a_function_gives_goals_of_a_dict(goals, tmp_path):
+def test_a_function_gives_goals_of_a_dict(goals):
     rule = lambda obs: (["go_to"] * len(obs), goals(len(obs)))  # noqa: E731
     skill = go_to()
     type(skill).goal_space = NESTED
     type(skill).reward = lambda self, step: step.goal["at"].sum(1)
     type(skill).termination = type(skill).success = lambda self, step: step.goal["at"][:, 0] > 9
-    run = declared([skill, Rest()], selector=rule).train(tmp_path / "run", quiet=True)
+    run = declared([skill, Rest()], selector=rule).train(quiet=True)
     player = run.player()
     player.act(np.zeros(2, np.float32))
     goal = run.policy.goal_now(player.memory)
@@ -367,10 +345,10 @@ def test_a_function_gives_goals_of_a_dict(goals, tmp_path):
     assert goal["byte"].tolist() == [1, 2]
 
 
-def test_a_function_gives_goals_of_a_tuple(tmp_path):
+def test_a_function_gives_goals_of_a_tuple():
     rule = lambda obs: (["go_to"] * len(obs), (obs / 4, np.ones(len(obs), int)))  # noqa: E731
     skills = [go_to("tuple"), Rest()]
-    run = declared(skills, selector=rule).train(tmp_path / "run", quiet=True)
+    run = declared(skills, selector=rule).train(quiet=True)
     player = run.player()
     player.act(np.ones(2, np.float32))
     goal = run.policy.goal_now(player.memory)
@@ -387,9 +365,9 @@ def test_a_function_gives_goals_of_a_tuple(tmp_path):
         lambda obs: (["go_to"] * len(obs), obs / 4, 1),
     ],
 )
-def test_another_form_of_skills_and_goals(rule, tmp_path):
+def test_another_form_of_skills_and_goals(rule):
     with pytest.raises(SkillError, match=r"return \(names, goals\), one of each per environment"):
-        evaluated(rule, SPACES["box"], tmp_path)
+        evaluated(rule, SPACES["box"])
     with pytest.raises(
         SkillError, match=r"no skill that it selects has goals|names 'go_to'|no arr"
     ):

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 from small_runs import goes_on, reports_every
 from toys import alone_in
-from worlds import ON, SMALL, SPACES, Point, Rest, declared, go_to
+from worlds import OFF, OFTEN, ON, SMALL, SPACES, Point, Rest, declared, go_to
 
 import skillweave as sw
 from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 
 often = reports_every(40)
-OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}
-OFTEN = sw.TrainDefaults(checkpoint_every=60)
 ALGORITHMS = {
     "PPO": (ON, False),
     "PPO, discrete": (ON, True),
@@ -50,10 +48,10 @@ def test_every_algorithm_learns_with_goals(name, tmp_path):
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("as_dict", [False, True])
-def test_goals_of_every_space(space, as_dict, tmp_path):
+def test_goals_of_every_space(space, as_dict):
     env = functools.partial(Point, as_dict=as_dict)
     hierarchy = declared([go_to(space), Rest()], env=env, selector=rest, steps=130)
-    run = hierarchy.train(tmp_path / "run", quiet=True)
+    run = hierarchy.train(quiet=True)
     report = run.evaluate(4, skill="go_to")
     assert report.skills["go_to"].calls == 4
     assert run.policy.skills.policies[0].observation_space["goal"] == SPACES[space]
@@ -92,7 +90,7 @@ def test_goals_of_a_damaged_checkpoint_are_refused():
         collector.restore(state)
 
 
-def test_goals_where_other_calls_come_first(tmp_path):
+def test_goals_where_other_calls_come_first():
     class Late(sw.Skill):
         max_steps = 5
 
@@ -105,7 +103,7 @@ def test_goals_where_other_calls_come_first(tmp_path):
     late = type("GoBack", (type(go_to()),), {"initiation": lambda self, obs: obs[:, 0] < -0.3})()
     apart = sw.Apart(start_calls=2, episode_calls=3)
     hierarchy = declared([go_to(), Late(), late], selector=rest_or_go, steps=600, apart=apart)
-    run = hierarchy.train(tmp_path / "run", quiet=True)
+    run = hierarchy.train(quiet=True)
     assert run.evaluate(3, skill="go_back").skills["go_back"].steps > 0
 
 
@@ -113,7 +111,7 @@ def rest_or_go(obs):
     return np.full(len(obs), "go_to"), {"go_to": np.zeros((len(obs), 2)), "go_back": obs / 4}
 
 
-def test_a_skill_with_goals_beside_one_without_learns_together(tmp_path):
+def test_a_skill_with_goals_beside_one_without_learns_together():
     class Right(sw.Skill):
         max_steps = 4
 
@@ -122,12 +120,12 @@ def test_a_skill_with_goals_beside_one_without_learns_together(tmp_path):
 
     selector = sw.PPO(num_envs=4, n_steps=64, batch_size=16, network=SMALL)
     hierarchy = declared([Right(), go_to()], selector=selector, learn="together", steps=1200)
-    run = hierarchy.train(tmp_path / "run", quiet=True)
+    run = hierarchy.train(quiet=True)
     assert run.evaluate(3, skill="go_to").skills["go_to"].calls == 3
 
 
 @pytest.mark.slow
-def test_goals_in_processes(tmp_path):
+def test_goals_in_processes():
     spec = EnvSpec(Point, engine="sync", workers=2)
-    run = declared(env=spec).train(tmp_path / "run", quiet=True)
+    run = declared(env=spec).train(quiet=True)
     assert run.evaluate(2, skill="go_to").skills["go_to"].calls == 2

@@ -32,9 +32,9 @@ from skillweave.spaces import obs_dtype
         (lambda self, obs, rng: obs.no, r"goals\(\) raised AttributeError"),
     ],
 )
-def test_goals_that_are_wrong(goals, says, tmp_path):
+def test_goals_that_are_wrong(goals, says):
     with pytest.raises(SkillError, match=says):
-        declared([go_to(goals=goals)]).train(tmp_path / "run", quiet=True)
+        declared([go_to(goals=goals)]).train(quiet=True)
 
 
 UNSUPPORTED: dict[str, Any] = {
@@ -50,11 +50,11 @@ UNSUPPORTED: dict[str, Any] = {
 
 @pytest.mark.parametrize(("space", "says"), UNSUPPORTED.values(), ids=UNSUPPORTED)
 @pytest.mark.parametrize("learns", [True, False])
-def test_a_space_that_is_not_supported_is_named_with_its_skill(space, says, learns, tmp_path):
+def test_a_space_that_is_not_supported_is_named_with_its_skill(space, says, learns):
     how: dict[str, Any] = {} if learns else {"policy": lambda self, obs, goal: obs}
     skill = type("GoTo", (GoTo,), {"goal_space": space, **how})()
     with pytest.raises(DeclarationError, match=f"skill 'go_to': .*{says}"):
-        declared([skill]).train(tmp_path / "run", quiet=True)
+        declared([skill]).train(quiet=True)
 
 
 @pytest.mark.parametrize(
@@ -68,15 +68,15 @@ def test_a_space_that_is_not_supported_is_named_with_its_skill(space, says, lear
         ("tuple", (0, 1, 2), "a tuple of 2 parts was expected"),
     ],
 )
-def test_goals_without_the_right_parts_are_named_with_their_skill(space, goals, says, tmp_path):
+def test_goals_without_the_right_parts_are_named_with_their_skill(space, goals, says):
     def choose(obs: Any) -> Any:
         return np.full(len(obs), "go_to"), goals
 
     with pytest.raises(SkillError, match=says):
-        declared([go_to(space)], selector=choose).train(tmp_path / "run", quiet=True)
+        declared([go_to(space)], selector=choose).train(quiet=True)
 
 
-def test_a_reward_that_ignores_the_goal_is_said(tmp_path, capsys):
+def test_a_reward_that_ignores_the_goal_is_said(capsys):
     class Blind(sw.Skill):
         name = "go_to"
         goal_space = SPACES["box"]
@@ -85,44 +85,12 @@ def test_a_reward_that_ignores_the_goal_is_said(tmp_path, capsys):
         def reward(self, step):
             return step.next_obs[:, 0]
 
-    declared([Blind()]).train(tmp_path / "run")
+    declared([Blind()]).train()
     said = capsys.readouterr()
     assert "none reads step.goal" in said.out + said.err
-    declared([go_to()]).train(tmp_path / "other")
+    declared([go_to()]).train()
     said = capsys.readouterr()
     assert "none reads step.goal" not in said.out + said.err
-
-
-def test_a_player_takes_a_goal(tmp_path):
-    class Walk(Rest):
-        name = "go_to"
-        goal_space = SPACES["box"]
-
-        def policy(self, obs, goal):
-            return np.clip(goal - obs, -1, 1)
-
-    run = declared([Walk()]).train(tmp_path / "run", quiet=True)
-    player = run.player(skill="go_to", goal=(0.5, -0.5))
-    assert np.allclose(player.act(np.zeros(2, np.float32)), (0.5, -0.5))
-    player.reset(goal=(0.25, 0.0))
-    assert np.allclose(player.act(np.zeros(2, np.float32)), (0.25, 0.0))
-    with pytest.raises(SkillError, match=r"the player gave the goal .* out of goal_space"):
-        run.player(skill="go_to", goal=(5, 5))
-    shape = r"gave a goal of shape \(1,\) for skill 'go_to', but \(2,\) was expected: one of Box"
-    with pytest.raises(SkillError, match=shape):
-        run.player(skill="go_to", goal=(0.5,))
-    with pytest.raises(DeclarationError, match=r"does not fit Box.*without an axis"):
-        player.act(np.zeros((1, 2), np.float32))
-    room = sw.Hierarchy(lambda: Point(as_dict=True), [Rest()], selector=lambda obs: [0] * len(obs))
-    player = room.train(tmp_path / "dict", quiet=True).player()
-    with pytest.raises(DeclarationError, match=r"does not fit Dict.*: obs has no part 'picture'"):
-        player.act({"place": ZERO})
-    with pytest.raises(
-        DeclarationError, match=r"does not fit Dict.*: obs is an array of shape \(2,"
-    ):
-        player.act(ZERO)
-    with pytest.raises(DeclarationError, match="policy that takes none: name a skill"):
-        run.player(goal=(0, 0))
 
 
 class Walk(Rest):
@@ -136,9 +104,34 @@ class Walk(Rest):
 ZERO = np.zeros(2, np.float32)
 
 
+def test_a_player_takes_a_goal():
+    run = declared([Walk()]).train(quiet=True)
+    player = run.player(skill="go_to", goal=(0.5, -0.5))
+    assert np.allclose(player.act(ZERO), (0.5, -0.5))
+    player.reset(goal=(0.25, 0.0))
+    assert np.allclose(player.act(ZERO), (0.25, 0.0))
+    with pytest.raises(SkillError, match=r"the player gave the goal .* out of goal_space"):
+        run.player(skill="go_to", goal=(5, 5))
+    shape = r"gave a goal of shape \(1,\) for skill 'go_to', but \(2,\) was expected: one of Box"
+    with pytest.raises(SkillError, match=shape):
+        run.player(skill="go_to", goal=(0.5,))
+    with pytest.raises(DeclarationError, match=r"does not fit Box.*without an axis"):
+        player.act(np.zeros((1, 2), np.float32))
+    room = sw.Hierarchy(lambda: Point(as_dict=True), [Rest()], selector=lambda obs: [0] * len(obs))
+    player = room.train(quiet=True).player()
+    with pytest.raises(DeclarationError, match=r"does not fit Dict.*: obs has no part 'picture'"):
+        player.act({"place": ZERO})
+    with pytest.raises(
+        DeclarationError, match=r"does not fit Dict.*: obs is an array of shape \(2,"
+    ):
+        player.act(ZERO)
+    with pytest.raises(DeclarationError, match="policy that takes none: name a skill"):
+        run.player(goal=(0, 0))
+
+
 @pytest.mark.parametrize("goal", [(5, 5), (1, 2, 3), "x", (0.1, (0.2, 0.3)), {"at": 1}, np.nan])
-def test_a_refused_goal_leaves_the_player_as_it_was(goal, tmp_path):
-    run = declared([Walk()]).train(tmp_path / "run", quiet=True)
+def test_a_refused_goal_leaves_the_player_as_it_was(goal):
+    run = declared([Walk()]).train(quiet=True)
     player = run.player(skill="go_to", goal=(0.5, -0.5))
     player.act(ZERO)
     with pytest.raises(SkillError, match="the player gave"):
@@ -148,7 +141,7 @@ def test_a_refused_goal_leaves_the_player_as_it_was(goal, tmp_path):
     assert np.allclose(player.act(ZERO), (0.5, -0.5))
 
 
-def test_a_player_never_acts_without_its_goal(tmp_path):
+def test_a_player_never_acts_without_its_goal():
     """Whether clip_goal moves a goal into the space shows where the episode starts."""
 
     class Stuck(Walk):
@@ -157,7 +150,7 @@ def test_a_player_never_acts_without_its_goal(tmp_path):
         def clip_goal(self, obs, goal):
             return np.where(obs[:, :1] > 0, goal.clip(-1, 1), goal)
 
-    run = declared([Stuck()]).train(tmp_path / "run", quiet=True)
+    run = declared([Stuck()]).train(quiet=True)
     player = run.player(skill="go_to", goal=(5, 5))
     for _ in range(2):
         with pytest.raises(SkillError, match=r"clip_goal\(\) gave the goal \[5.0, 5.0\]"):
@@ -165,8 +158,8 @@ def test_a_player_never_acts_without_its_goal(tmp_path):
     assert np.allclose(player.act(np.float32([0.5, 0])), (0.5, 1))
 
 
-def test_a_player_keeps_its_own_goal(tmp_path):
-    run = declared([Walk()]).train(tmp_path / "run", quiet=True)
+def test_a_player_keeps_its_own_goal():
+    run = declared([Walk()]).train(quiet=True)
     goal = np.array([0.5, 0.5], np.float32)
     player = run.player(skill="go_to", goal=goal)
     goal[:] = 0.1
@@ -187,14 +180,14 @@ def test_a_player_keeps_its_own_goal(tmp_path):
         ("tuple", 3, "gave"),
     ],
 )
-def test_a_player_says_which_goal_is_wrong(space, goal, says, tmp_path):
+def test_a_player_says_which_goal_is_wrong(space, goal, says):
     selector = sw.tree.Sequence(("go_to", lambda obs: obs))  # it is never asked
-    run = declared([go_to(space)], selector=selector).train(tmp_path / "run", quiet=True)
+    run = declared([go_to(space)], selector=selector).train(quiet=True)
     with pytest.raises(SkillError, match=says):
         run.player(skill="go_to", goal=goal)
 
 
-def test_goals_beyond_the_range_of_a_policy_are_said(recwarn, tmp_path):
+def test_goals_beyond_the_range_of_a_policy_are_said(recwarn):
     def said(**bounds):
         class Steered(Rest):
             name = "go_to"
@@ -202,7 +195,7 @@ def test_goals_beyond_the_range_of_a_policy_are_said(recwarn, tmp_path):
             policy = sw.from_torch(torch.nn.Linear(4, 2), sees=(0, 1, sw.Goal(**bounds)))
 
         recwarn.clear()
-        declared([Steered()]).train(tmp_path / str(bounds), quiet=True)
+        declared([Steered()]).train(quiet=True)
         return [str(w.message) for w in recwarn if "Goal.low" in str(w.message)]
 
     assert said() == said(low=-1, high=(1, 2)) == []
@@ -210,7 +203,7 @@ def test_goals_beyond_the_range_of_a_policy_are_said(recwarn, tmp_path):
     assert "Goal.high (1.0, 0.5)" in said(low=-1, high=(1, 0.5))[0]
 
 
-def test_policies_from_elsewhere_take_the_goal(tmp_path):
+def test_policies_from_elsewhere_take_the_goal():
     torch.manual_seed(0)
     network = torch.nn.Linear(4, 2)
 
@@ -219,7 +212,7 @@ def test_policies_from_elsewhere_take_the_goal(tmp_path):
         goal_space = SPACES["box"]
         policy = sw.from_torch(network, sees=(0, 1, sw.Goal()))
 
-    run = declared([Foreign()]).train(tmp_path / "run", quiet=True)
+    run = declared([Foreign()]).train(quiet=True)
     obs, goal = np.float32([0.1, -0.2]), np.float32([0.5, -0.5])
     action = run.player(skill="go_to", goal=goal).act(obs)
     with torch.no_grad():
@@ -294,9 +287,9 @@ TAKE_GOALS = {
 
 
 @pytest.mark.parametrize("name", TAKE_GOALS)
-def test_functions_get_the_goal_where_a_parameter_takes_it(name, tmp_path):
+def test_functions_get_the_goal_where_a_parameter_takes_it(name):
     skill = go_to(policy=TAKE_GOALS[name])
-    run = declared([skill]).train(tmp_path / "run", quiet=True)
+    run = declared([skill]).train(quiet=True)
     player = run.player(skill="go_to", goal=(0.5, -0.5))
     assert np.allclose(player.act(ZERO), (0.5, -0.5))
 
@@ -334,22 +327,18 @@ def test_weights_of_another_goal_space_are_refused(tmp_path):
         declared([wider(policy=sw.load_policy(tmp_path / "policy"))]).check_spaces()
 
 
-def test_a_selector_of_other_goals_is_refused(tmp_path):
+def test_a_selector_of_other_goals_is_refused():
     """Its skill is ready, so that only the selector has learnt."""
-
-    def walk(self, obs, goal):
-        return np.clip(goal - obs, -1, 1)
-
     small = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=ON.network)
-    hierarchy = declared([go_to(policy=walk)], selector=small)
-    run = hierarchy.train(tmp_path / "run", quiet=True)
-    other = declared([wider(policy=walk)], selector=small)
+    hierarchy = declared([go_to(policy=Walk.policy)], selector=small)
+    run = hierarchy.train(quiet=True)
+    other = declared([wider(policy=Walk.policy)], selector=small)
     with pytest.raises(RunError, match="'go_to' was trained for goals of"):
         sw.load(run.path, other)
     with pytest.raises(RunError, match="'go_to' was trained for goals of"):
         other.train(run.path, resume=True, quiet=True)
     with pytest.raises(RunError, match=r"'selector' cannot start .*: its actions are others here"):
-        other.train(tmp_path / "next", start_from=run.path, quiet=True)
+        other.train(start_from=run.path, quiet=True)
 
 
 def test_a_network_that_leaves_out_the_goal_is_refused():
@@ -367,8 +356,8 @@ def test_a_network_that_sees_what_is_not_there_is_named_with_its_skill():
         declared(algorithm=wrong).check_spaces()
 
 
-def test_goals_are_the_same_for_the_same_seed(tmp_path):
-    run = declared().train(tmp_path / "run", quiet=True)
+def test_goals_are_the_same_for_the_same_seed():
+    run = declared().train(quiet=True)
 
     def goals_with(num_envs):
         found = {}
@@ -418,14 +407,14 @@ def test_captions_show_the_goal():
     assert shown_goal(one).startswith("(at (")
 
 
-def test_goals_reach_the_label_of_a_film(tmp_path):
-    run = declared([go_to(), Rest()], selector=far_corner).train(tmp_path / "run", quiet=True)
+def test_goals_reach_the_label_of_a_film():
+    run = declared([go_to(), Rest()], selector=far_corner).train(quiet=True)
     policy = run.policy
     memory = policy.start(1)
     _, memory = policy.act(memory, np.zeros((1, 2), np.float32))
     assert np.allclose(policy.goal_now(memory), 0.9)
     player = run.player()
-    player.act(np.zeros(2, np.float32))
+    player.act(ZERO)
     assert np.allclose(policy.goal_now(player.memory), 0.9)
 
 
@@ -449,11 +438,11 @@ SELECTORS = {
 @pytest.mark.parametrize(
     ("stage", "learns_by"), [("go_to", "PPO"), ("selector", "PPO"), ("selector", "DQN")]
 )
-def test_evolution_with_goals(stage, learns_by, tmp_path):
+def test_evolution_with_goals(stage, learns_by):
     evolution = Evolution(population=2, generations=2, episodes=1)
     late = type("Late", (Rest,), {"initiation": lambda self, obs: obs[:, 0] > 0})()
     how = {"selector": SELECTORS[learns_by], "steps": 900}
     run = declared([go_to("number"), late], **how).train(
-        tmp_path / "run", evolve={stage: evolution}, eval_every=300, quiet=True
+        evolve={stage: evolution}, eval_every=300, quiet=True
     )
     assert run.evaluate(2, skill="go_to").skills["go_to"].calls == 2

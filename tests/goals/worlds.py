@@ -11,6 +11,9 @@ import skillweave as sw
 
 SMALL = sw.Network(hidden=(8,))
 ON = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
+SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)
+OFF: Any = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}
+OFTEN = sw.TrainDefaults(checkpoint_every=60)
 WAYS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]], np.float32)
 
 

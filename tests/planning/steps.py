@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from skillweave.planning import Predicate
+from skillweave.planning import Planner, Predicate
+from skillweave.policies.core import LIMIT
+from skillweave.skills import LastCall
 from skillweave.types import Array, Step
 
 
@@ -40,4 +43,20 @@ def column(i: int) -> Any:
 
 def at(*places: float) -> Predicate:
     """The predicate that the first number is one of these."""
-    return Predicate(lambda obs: np.isin(obs[:, 0], places), f"at {places}", "obs")
+    return Predicate(lambda obs: np.isin(obs[:, 0], places), f"at {places[0]}", "obs")
+
+
+def assert_not_repeated(planner: Planner, ahead: Callable[[Any], Any]) -> None:
+    """At 2 is a wall: choices that are ``ahead`` lead nowhere, but are made a few times at most."""
+    memory, obs, chosen = planner.start(1), np.float32([[2]]), [True]
+    while chosen[-1] and len(chosen) < 7:
+        choice, memory = planner.act(memory, obs)
+        chosen.append(bool(ahead(choice)[0]))
+        before, obs = obs, np.float32([[2 * chosen[-1]]])
+        skill = choice["skill"] if choice.dtype.fields else choice
+        last = LastCall(skill, np.full(1, LIMIT, np.int8), np.zeros(1, bool))
+        for _ in range(3):
+            memory = planner.watch(memory, step_to(obs, before), last)
+    assert chosen[1]
+    assert not chosen[-1]
+    assert len(chosen) <= 5

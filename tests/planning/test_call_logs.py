@@ -9,14 +9,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from goals.worlds import Point
 from ready_selectors.chain import (
     DOOR,
     KEY,
     LAST,
     NAMES,
-    PLACE,
     SPEC,
-    Corridor,
     GetKey,
     Leave,
     OpenDoor,
@@ -35,6 +34,7 @@ from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.skills.skill_set import SkillSet
 
+POINT = EnvSpec(lambda: Point(as_dict=True), engine="sync")  # observations are a Dict
 SKILLS = (GetKey(), OpenDoor(), Leave(), Wait())
 
 
@@ -169,43 +169,17 @@ def test_a_call_that_the_time_limit_cut() -> None:
     assert made.truncated.tolist() == made.was_cut.tolist()
 
 
-class Pair(gym.Env):
-    """Observations are a Dict, actions a Box."""
-
-    observation_space = gym.spaces.Dict(
-        {
-            "place": gym.spaces.Box(-9, 9, (2,), np.float32),
-            "picture": gym.spaces.Box(0, 255, (4, 4, 1), np.uint8),
-        }
-    )
-    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        self.place, self.t = np.zeros(2, np.float32), 0
-        return self.seen(), {}
-
-    def seen(self) -> Any:
-        return {"place": self.place.copy(), "picture": np.full((4, 4, 1), self.t, np.uint8)}
-
-    def step(self, action: Any) -> Any:
-        self.place, self.t = self.place + action, self.t + 1
-        return self.seen(), 0.5, False, self.t == 7, {}
-
-
 def test_a_log_is_saved_and_read(log: CallLog, tmp_path: Any) -> None:
     class Move(Skill):
         max_steps = 3
         policy = ScriptedPolicy(
             lambda obs: np.full((len(obs), 2), 0.25, np.float32),
-            Pair.observation_space,
-            Pair.action_space,
+            *POINT.spaces,
         )
 
-    spec, moves = EnvSpec(Pair, engine="sync"), SkillSet((Move(),), (Move.policy,))
-    pairs = record_calls(spec, moves, 40, num_envs=2)
-    assert pairs.next_obs["place"].max() == 1.75
-    for i, made in enumerate((log, pairs, record_calls(SPEC, skill_set(), 1))):
+    points = record_calls(POINT, SkillSet((Move(),), (Move.policy,)), 40, num_envs=2)
+    assert points.next_obs["picture"].max() == 21  # it shows the time
+    for i, made in enumerate((log, points, record_calls(SPEC, skill_set(), 1))):
         made.save(tmp_path / f"{i}.safetensors")
         read = CallLog.load(str(tmp_path / f"{i}.safetensors"))
         assert (read.skills, read.lengths, read.checksums) == (
@@ -332,7 +306,3 @@ def test_wrong_arguments(how: Any, kind: Any, message: str) -> None:
     given = {"env": SPEC, "skills": skill_set(), "steps": 10} | how
     with pytest.raises(kind, match=message):
         record_calls(**given)
-
-
-def test_the_corridor_is_what_the_loop_takes_it_for() -> None:
-    assert (PLACE, KEY, DOOR, Corridor.action_space.n) == (0, 1, 2, 3)

@@ -29,6 +29,7 @@ from skillweave.planning import CallLog, record_calls
 from skillweave.planning.columns import columns_of
 from skillweave.policies.core import CallEnd
 from skillweave.skills import Skill
+from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.skills.skill_set import SkillSet
 from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.types import Array, Step
@@ -59,33 +60,18 @@ def chain() -> Automaton:
 
 def lengths_of(obs: Array) -> Array:
     """Choices of a skill and a length: where, and how far, by the place."""
-    return np.where(obs[:, KEY] == 0, 0, np.where(obs[:, DOOR] == 0, 2, 4)) + obs[:, PLACE] % 2
+    odd = obs[:, PLACE].astype(int) % 2
+    return np.where(obs[:, KEY] == 0, 0, np.where(obs[:, DOOR] == 0, 2, 4)) + odd
 
 
 def policies() -> dict[str, HierarchyPolicy]:
     skills = (GetKey(), OpenDoor(), Leave(), Wait())
     lengths = skills_of(*skills, call_steps=Lengths(1, 3))
-
-    class Chooser:
-        observation_space, action_space = Fixed.observation_space, gym.spaces.Discrete(8)
-        labels: tuple[str, ...] = ()
-
-        def start(self, n: int) -> Any:
-            return {}
-
-        def act(self, memory: Any, obs: Array, mask: Any = None, **_: Any) -> Any:
-            return lengths_of(obs).astype(np.int64), memory
-
-        def observe(self, memory: Any, step: Step) -> Any:
-            return memory
-
-        def acting(self, memory: Any) -> None:
-            return None
-
+    chooser = ScriptedPolicy(lengths_of, Fixed.observation_space, gym.spaces.Discrete(8))
     return {
         "automaton": hierarchy(chain()),
         "limits": hierarchy(chain(), call_steps=2),
-        "lengths": HierarchyPolicy(Chooser(), lengths),  # type: ignore[arg-type]
+        "lengths": HierarchyPolicy(chooser, lengths),
     }
 
 

@@ -7,19 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from planning.logs import log_of
+from planning.steps import at
 
 from skillweave.planning import CallLog, GoalTask, Mission, Planner, RewardMachine, held
 from skillweave.planning.forecast import forecast
 
 A, B = 0, 1
-
-
-def at(*places: float) -> Any:
-    def here(obs: Any) -> Any:
-        return np.isin(obs[:, 0], places)
-
-    here.__name__ = f"at {places[0]}"
-    return here
 
 
 def goes_right(share: float, episodes: int = 100) -> CallLog:

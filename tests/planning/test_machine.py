@@ -94,18 +94,6 @@ def test_rewards_may_be_functions_of_a_step() -> None:
     assert reward.tolist() == [5.0, 0.0]  # a task that is over pays nothing
 
 
-def test_several_states_of_one_step_at_once() -> None:
-    task = RewardMachine({("a", "b"): (A, 1.0), ("b", "c"): held(B, 2)}, accepting={"c"})
-    every = np.array([[0, 0], [1, 0], [1, 1], [2, 0]])
-    readings = task.acts.read(step_to([[1, 1], [0, 0]]))
-    after, reward = task.acts.advance(np.stack([every, every]), readings)
-    assert after.tolist() == [
-        [[1, 0], [1, 1], [2, 0], [2, 0]],
-        [[0, 0], [1, 0], [1, 0], [2, 0]],
-    ]
-    assert reward.tolist() == [[1.0, 0.0, 0.0, 0.0], [0.0] * 4]
-
-
 def test_predicates_of_steps_and_of_observations() -> None:
     def moved(step: Any) -> Any:
         return step.next_obs[:, 0] != step.obs[:, 0]

@@ -131,21 +131,6 @@ def test_a_mission_is_followed_as_its_parts_are(tree: Any, avoids: bool, seed: i
         assert done.tolist() == [r.done or f for r, f in zip(references, failed, strict=True)]
 
 
-def test_two_parts_may_go_on_in_the_same_step() -> None:
-    task = Mission(in_any_order(P[0], P[1]), P[2])
-    state, reward, _ = task.step(task.start(1), step_to([[1, 1, 0]]))
-    assert reward.tolist() == [0.5]
-    assert task.state_names[int(state[0, 0])] == "c"
-
-
-def test_a_counter_goes_on_while_the_other_part_goes_on() -> None:
-    task = Mission(in_any_order(P[0], held(P[1], 3)))
-    state = task.start(1)
-    for row in ([0, 1], [1, 1], [0, 1]):
-        state, _, done = task.step(state, step_to([row]))
-    assert done[0]
-
-
 def test_a_mission_that_repeats() -> None:
     twice = Mission(P[0], P[1], repeat=2)
     assert twice.state_names == ("a", "b", "a #2", "b #2", "done")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from ready_selectors.chain import PLACE, SPEC, GetKey, OpenDoor, Wait, at_four, hierarchy
+from planning.untrained import run_of
+from ready_selectors.chain import PLACE, GetKey, OpenDoor, Wait, at_four
 
-import skillweave as sw
-from skillweave.api import Run
 from skillweave.errors import DeclarationError
 
 
@@ -30,16 +28,8 @@ def at_five(obs: Any) -> Any:
     return obs[:, PLACE] == 5
 
 
-def run_of(**how: Any) -> Run:
-    skills = (ToKey(), OpenDoor(), Then())
-    declared = sw.Hierarchy(
-        SPEC, skills, call_steps=None, selector=lambda obs: ["to_key"] * len(obs), **how
-    )
-    return Run(declared, Path("runs/words"), hierarchy(declared.selector, skills=skills))
-
-
 def test_skills_names_mean_their_success_and_a_hierarchy_has_words() -> None:
-    run = run_of(predicates={"four": at_four})
+    run = run_of(ToKey(), OpenDoor(), Then(), predicates={"four": at_four})
     log = run.log_calls(2_000, info=("door",))
     planned = run.plan("to_key then four")
     assert planned.evaluate(10, quiet=True).success_rate == 1.0
@@ -65,4 +55,4 @@ def test_skills_names_mean_their_success_and_a_hierarchy_has_words() -> None:
 )
 def test_wrong_words_are_refused_where_they_are_declared(words: Any, says: str) -> None:
     with pytest.raises(DeclarationError, match=says):
-        run_of(predicates=words)
+        run_of(ToKey(), OpenDoor(), Then(), predicates=words)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from reference_calls import T, Walk, scripted
 
@@ -23,11 +21,11 @@ class Last(First):
         return step.terminated | step.truncated
 
 
-def test_a_call_that_ends_by_itself_with_the_episode_is_done(tmp_path: Path) -> None:
+def test_a_call_that_ends_by_itself_with_the_episode_is_done() -> None:
     env = sw.EnvSpec(Walk, engine="sync", workers=1)
     choose = lambda obs: np.where(obs[:, T] < 2, "first", "last")  # noqa: E731
     hierarchy = sw.Hierarchy(env, [First(), Last()], call_steps=None, selector=choose)
-    run = hierarchy.train(tmp_path / "run", quiet=True)
+    run = hierarchy.train(quiet=True)
     for alone in (None, "last"):
         report = run.evaluate(4, skill=alone, quiet=True).skills["last"]
         assert (report.ended["own"], report.own_with_episode, report.calls) == (4, 4, 4)

@@ -119,17 +119,6 @@ def test_rows_are_as_one_environment_each(name: str) -> None:
     assert len({str(choice) for choice in many[0]}) > (name != "goals of a guide")
 
 
-def test_rows_that_are_not_asked_do_not_change() -> None:
-    planner = PLANS["mission"]()
-    memory = planner.in_place.start(4)
-    before = {name: value.copy() for name, value in flat(memory).items()}
-    rows = np.array([2, 0])
-    planner.in_place.act(memory, rows, planner.log.start[:2], Turn(World()))
-    for name, value in flat(memory).items():
-        np.testing.assert_array_equal(value[[1, 3]], before[name][[1, 3]])
-    assert memory["tried"]["count"].tolist() == [1, 0, 1, 0]
-
-
 def bare(plans: Planned) -> Planned:
     """The same plan with the user's own functions, as an export has it."""
     features = tuple(

@@ -8,8 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from goals.worlds import Point
 from planning.logs import log_of
-from planning.steps import at, step_to
+from planning.steps import assert_not_repeated, at, step_to
 from ready_selectors.chain import (
     DOOR,
     KEY,
@@ -17,6 +18,7 @@ from ready_selectors.chain import (
     SPEC,
     Corridor,
     GetKey,
+    InDict,
     Leave,
     OpenDoor,
     Wait,
@@ -302,21 +304,7 @@ def test_a_call_that_failed_is_not_repeated_forever() -> None:
     """The log says that "right" leads from 2 to 3; now there is a wall."""
     log = line()
     planner = Planner(log, at(9), neighbors=1, gamma=GAMMA).among(log.skills)
-    memory = planner.start(1)
-    chosen = []
-    obs = np.float32([[2]])
-    for _ in range(6):
-        choice, memory = planner.act(memory, obs)
-        chosen.append(int(choice[0]))
-        before, obs = obs, np.float32([[2]]) if choice[0] else np.float32([[0]])
-        last = LastCall(choice, np.full(1, CallEnd.LIMIT, np.int8), np.zeros(1, bool))
-        for _ in range(3):
-            memory = planner.watch(memory, step_to(obs, before), last)
-        if chosen[-1] == 0:
-            break
-    assert chosen[0] == 1
-    assert chosen[-1] == 0
-    assert len(chosen) <= 4
+    assert_not_repeated(planner, lambda choice: choice == 1)
     # A new episode has none of it.
     assert planner.act(planner.start(1), np.float32([[2]]))[0].tolist() == [1]
 
@@ -416,20 +404,19 @@ class Field(gym.Env):
         return np.float32([self.place]), 0.0, False, self.t == 60, {}
 
 
+def pair_in(spec: EnvSpec, left: Any, right: Any) -> SkillSet:
+    """Skills of two steps that always take the same action."""
+
+    def go(name: str, action: Any) -> Any:
+        policy = ScriptedPolicy(lambda obs: np.repeat([action], len(obs), 0), *spec.spaces)
+        return type(name, (Skill,), {"max_steps": 2, "policy": policy})()
+
+    return skills_of(go("left", left), go("right", right))
+
+
 def test_exploring_reaches_further_than_chance() -> None:
-    def move(action: int) -> Any:
-        return ScriptedPolicy(
-            lambda obs: np.full(len(obs), action), Field.observation_space, Field.action_space
-        )
-
-    class Left(Skill):
-        policy = move(0)
-
-    class Right(Skill):
-        policy = move(1)
-
-    skills = SkillSet((Left(), Right()), (Left.policy, Right.policy), call_steps=2)
     spec = EnvSpec(Field, engine="sync")
+    skills = pair_in(spec, 0, 1)
     explorer = Explorer(0.1, every=200, temperature=0.01)
     assert explorer.new_share() == 1.0
     seen = record_calls(spec, skills, 2_400, num_envs=4, choose=explorer)
@@ -592,47 +579,16 @@ def test_a_word_lets_it_explore() -> None:
     assert seen.steps >= 400
 
 
-class Places(gym.ObservationWrapper):  # type: ignore[type-arg]
-    """The corridor in a Dict, perhaps with a picture of it."""
-
-    def __init__(self, env: Any, picture: bool) -> None:
-        super().__init__(env)
-        spaces = {"at": gym.spaces.Box(0, 9, (1,)), "has": gym.spaces.MultiBinary(2)}
-        image = {"picture": gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)} if picture else {}
-        self.observation_space = gym.spaces.Dict(spaces | image)
-
-    def observation(self, obs: Any) -> Any:
-        numbers = {"at": obs[:1], "has": obs[1:].astype(np.int8)}
-        picture = np.full((8, 8, 1), 20 * obs[0], np.uint8)
-        return {k: (numbers | {"picture": picture})[k] for k in self.observation_space.spaces}
-
-
-def in_places(picture: bool) -> tuple[EnvSpec, SkillSet]:
-    def go(action: int) -> Any:
-        class Go(Skill):
-            name, max_steps = ("left", "stay", "right")[action], 2
-            policy = ScriptedPolicy(
-                lambda obs: np.full(len(obs), action),
-                spec.spaces.observation,
-                Corridor.action_space,
-            )
-
-        return Go()
-
-    spec = EnvSpec(lambda: Places(Corridor(), picture), engine="sync")
-    skills = (go(0), go(2))
-    return spec, skills_of(*skills)
-
-
 def test_observations_in_a_dict_are_planned_on() -> None:
-    spec, skills = in_places(picture=False)
+    spec = EnvSpec(lambda: InDict(Corridor()), engine="sync")
+    skills = pair_in(spec, 0, 2)
     log = record_calls(spec, skills, 1_500, num_envs=4)
-    task = Mission(lambda obs: obs["has"][:, 0] == 1, lambda obs: obs["at"][:, 0] == 4)
+    task = Mission(lambda obs: obs["at"][:, 0] == 0, lambda obs: obs["at"][:, 0] == 4)
     planner = Planner(log, task, skills=skills).among(("left", "right"))
     here = log.start[:1].copy()
-    here["at"], here["has"] = 2.0, 0
+    here["at"] = 2.0
     assert planner.act(planner.start(1), here)[0].tolist() == [0]
-    with pytest.raises(SkillError, match="Dict with the keys 'at', 'has'"):
+    with pytest.raises(SkillError, match="Dict with the keys 'at', 'door'"):
         Planner(log, lambda obs: obs[:, 0] > 3)
     near = GoalTask(lambda obs, goal: obs["at"][:, 0] == goal[..., 0], columns=(0,))
     with pytest.raises(DeclarationError, match="columns are places in vectors"):
@@ -640,12 +596,12 @@ def test_observations_in_a_dict_are_planned_on() -> None:
 
 
 def test_images_need_features() -> None:
-    spec, skills = in_places(picture=True)
-    log = record_calls(spec, skills, 600, num_envs=4)
-    task = Mission(lambda obs: obs["at"][:, 0] == 6)
+    spec = EnvSpec(lambda: Point(as_dict=True), engine="sync")
+    log = record_calls(spec, pair_in(spec, *np.float32([[-1, 0], [1, 0]])), 600, num_envs=4)
+    task = Mission(lambda obs: obs["place"][:, 0] > 1.5)
     with pytest.raises(DeclarationError, match=r"sees images, .*features="):
         Planner(log, task)
-    planner = Planner(log, task, features=lambda obs: obs["at"]).among(("left", "right"))
+    planner = Planner(log, task, features=lambda obs: obs["place"][:, 0]).among(("left", "right"))
     assert planner.act(planner.start(1), log.start[:1])[0].tolist() == [1]
 
 
@@ -680,17 +636,16 @@ def test_its_checksum_is_of_log_and_task(log: CallLog) -> None:
     assert len({first, *others}) == 4
 
 
-def test_it_is_declared_as_a_selector(log: CallLog, tmp_path: Any) -> None:
-
+def test_it_is_declared_as_a_selector(log: CallLog) -> None:
     def declared(task: Any) -> Hierarchy:
         return Hierarchy(SPEC, list(SKILLS), selector=Planner(log, task), call_steps=None)
 
     task = Mission(has_key, at_end)
-    run = declared(task).train(tmp_path / "run", seed=0, quiet=True)
+    run = declared(task).train(seed=0, quiet=True)
     assert np.mean(run.evaluate(5).returns) == 1.0
-    assert declared(task).load(tmp_path / "run").policy is not None
+    assert declared(task).load(run.path).policy is not None
     with pytest.raises(RunError, match="the selector had the policy planner"):
-        declared(has_key).load(tmp_path / "run")
+        declared(has_key).load(run.path)
 
 
 def test_calls_behind_a_wall_do_not_count() -> None:

@@ -89,10 +89,10 @@ def test_a_plan_uses_the_runs_own_calls(run: Run) -> None:
     )
 
 
-def test_keys_of_info_of_earlier_calls_are_recorded_again(tmp_path: Path) -> None:
+def test_keys_of_info_of_earlier_calls_are_recorded_again() -> None:
     hierarchy = declare(Left())
     hierarchy.env = sw.EnvSpec(Informed, engine="sync", workers=1)
-    run = hierarchy.train(tmp_path / "run", quiet=True)
+    run = hierarchy.train(quiet=True)
     first = run.log_calls(100, info=("half",))
     assert tuple(run.log_calls(100).info) == ("half",)
     with pytest.warns(UserWarning, match=r"replaced by the new one.*info keys half"):
@@ -108,7 +108,7 @@ class Informed(sw.EnvSpec("CartPole-v1").make().unwrapped.__class__):  # type: i
         return obs, reward, over, cut, {"half": obs[0] / 2, "third": obs[0] / 3}
 
 
-def test_calls_of_skills_that_learnt_on_are_not_used(run: Run, tmp_path: Path) -> None:
+def test_calls_of_skills_that_learnt_on_are_not_used(run: Run) -> None:
     old = run.log_calls(300)
     more = declare(Left(), Right())
     more.apart = sw.Apart(skill_steps=200, selector_steps=100)
@@ -118,7 +118,7 @@ def test_calls_of_skills_that_learnt_on_are_not_used(run: Run, tmp_path: Path) -
     with pytest.warns(UserWarning, match="before they learnt on. The new log replaces it"):
         new = run.log_calls(100)
     assert same(run.calls, new)
-    other = declare(Left(), Right()).train(tmp_path / "other", quiet=True, seed=1)
+    other = declare(Left(), Right()).train(quiet=True, seed=1)
     shutil.copy(run.path / CALLS, other.path)
     with pytest.raises(RunError, match="belongs to another run"):
         other.calls  # noqa: B018
@@ -221,18 +221,11 @@ def test_an_interrupted_recording_keeps_its_calls(run: Run) -> None:
     assert (run.calls.end_reason > 0).all()
 
 
-def test_a_plain_agent_has_no_calls(tmp_path: Path) -> None:
+def test_a_plain_agent_has_no_calls() -> None:
     env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
-    agent = sw.train_agent(env, SMALL, 100, tmp_path / "agent", quiet=True)
+    agent = sw.train_agent(env, SMALL, 100, quiet=True)
     with pytest.raises(DeclarationError, match="plain agent"):
         agent.calls  # noqa: B018
-
-
-def test_the_file_is_of_the_directory(run: Run) -> None:
-    run.log_calls(100)
-    log = run_log.load_calls(RunDirectory.open(run.path))
-    assert log is not None
-    assert same(log, run.calls)
 
 
 def test_calls_without_the_skills_code_are_replaced_by_calls_with_it(run: Run) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from planning.untrained import run_of
 from ready_selectors.chain import (
     PLACE,
     SPEC,
@@ -14,11 +15,9 @@ from ready_selectors.chain import (
     GetKey,
     InDict,
     Leave,
-    OpenDoor,
     Wait,
     always,
     at_four,
-    hierarchy,
 )
 
 import skillweave as sw
@@ -44,12 +43,7 @@ def door_open(step: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def run() -> Run:
-    """Skills that nothing trained, under a selector that always calls the first."""
-    skills = [GetKey(), OpenDoor(), Leave(), Wait()]
-    declared = sw.Hierarchy(
-        SPEC, skills, call_steps=None, selector=lambda obs: ["get_key"] * len(obs)
-    )
-    return Run(declared, Path("runs/corridor"), hierarchy(declared.selector))
+    return run_of()
 
 
 @pytest.fixture(scope="module")
@@ -179,11 +173,8 @@ def test_tasks_and_skills_go_by_the_environments_own_reward_and_success() -> Non
     def won(step: Any) -> Any:
         return step.info["success"]
 
-    skills = [ToPay(), Back(), Wait()]
-    declared = sw.Hierarchy(
-        sw.EnvSpec(Paying), skills, call_steps=None, selector=lambda obs: ["wait"] * len(obs)
-    )
-    run = Run(declared, Path("runs/paying"), hierarchy(declared.selector, skills=tuple(skills)))
+    rule = lambda obs: ["wait"] * len(obs)  # noqa: E731
+    run = run_of(ToPay(), Back(), Wait(), spec=sw.EnvSpec(Paying), selector=rule)
     log = run.log_calls(5_000, info=("success",))
     planned = run.plan(Mission(won, paid, won, paid), log)
     assert planned.evaluate(20, quiet=True).success_rate == 1.0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from planning.logs import log_of
 from planning.steps import step_to
+from planning.untrained import run_of
 from ready_selectors.chain import (
     DOOR,
     KEY,
@@ -24,7 +24,6 @@ from ready_selectors.chain import (
     Wait,
     always,
     at_four,
-    bound,
     has_key,
     hierarchy,
 )
@@ -32,15 +31,13 @@ from ready_selectors.chain import (
 import skillweave as sw
 from skillweave.api import Run
 from skillweave.errors import DeclarationError, EnvError, SkillweaveError
-from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.networks.config import RNN, Network
 from skillweave.planning import CallLog, GoalTask, Mission, Planner, held
 from skillweave.planning.mission import as_task
 from skillweave.planning.task_env import OwnView, Tasked
 from skillweave.policies.core import CallEnd
-from skillweave.skills import LastCall, ready_policy
-from skillweave.skills.foreign_policy import fitted, made_up
-from skillweave.skills.skill_set import SkillSet
+from skillweave.skills import LastCall
+from skillweave.skills.foreign_policy import made_up
 
 QUICK: dict[str, Any] = {"num_envs": 4, "n_steps": 32, "batch_size": 32, "update_epochs": 2}
 
@@ -50,19 +47,6 @@ def door_open(obs: Any) -> Any:
 
 
 TASK = Mission(at_four, door_open, held(at_four, 2))
-
-
-def run_of(skills: Any = (), **how: Any) -> Run:
-    """Skills that nothing trained, under a selector that always calls the first."""
-    skills = list(skills) or [GetKey(), OpenDoor(), Leave(), Wait()]
-    first = skills[0].name
-    declared = sw.Hierarchy(
-        SPEC, skills, **{"call_steps": None, "selector": lambda obs: [first] * len(obs)} | how
-    )
-    ready = [fitted(ready_policy(s), *SPEC.spaces, s.name, "corridor") for s in skills]
-    skill_set = SkillSet(tuple(skills), tuple(ready), tuple(declared.reflexes))
-    selector = bound(declared.selector, tuple(s.name for s in skills))
-    return Run(declared, Path("runs/corridor"), HierarchyPolicy(selector, skill_set))
 
 
 @pytest.fixture(scope="module")
@@ -93,40 +77,38 @@ def test_a_selector_starts_as_the_plan(planned: Run) -> None:
     assert (q[np.arange(len(q)), chosen] >= 0.95 * q.max(1)).all()
 
 
-def test_only_a_new_run_learns_to_choose_as_the_plan(
-    planned: Run, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_only_a_new_run_learns_to_choose_as_the_plan(planned: Run, monkeypatch: Any) -> None:
     declared = planned.with_selector(sw.PPO(**QUICK), steps=128)
-    declared.train(tmp_path / "run", quiet=True)
+    run = declared.train(quiet=True)
 
     def again(*given: Any) -> Any:
         raise AssertionError("it learnt the plan's choices again")
 
     monkeypatch.setattr("skillweave.api.planning.imitate", again)
-    assert declared.train(tmp_path / "run", quiet=True, resume=True).policy is not None
+    assert declared.train(run.path, quiet=True, resume=True).policy is not None
     with pytest.raises(AssertionError, match="again"):
-        declared.train(tmp_path / "other", quiet=True)
+        declared.train(quiet=True)
 
 
 @pytest.mark.slow
-def test_it_is_trained_and_loaded(planned: Run, tmp_path: Path) -> None:
+def test_it_is_trained_and_loaded(planned: Run) -> None:
     declared = planned.with_selector(sw.PPO(**QUICK), steps=400)
-    run = declared.train(tmp_path / "run", seed=3, quiet=True, checkpoint_every=128)
+    run = declared.train(seed=3, quiet=True, checkpoint_every=128)
     score = run.evaluate(20, quiet=True)
     assert score.success_rate is not None
     assert score.success_rate > 0.9
     assert score.mean == pytest.approx(score.success_rate, abs=0.1), "the reward is the task's"
-    loaded = planned.with_selector(sw.PPO(**QUICK), steps=400).load(tmp_path / "run")
+    loaded = planned.with_selector(sw.PPO(**QUICK), steps=400).load(run.path)
     assert loaded.evaluate(20, quiet=True).returns == score.returns
-    rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
     assert any("reference_kl" in row for row in rows), "the plan guides it"
     more = planned.with_selector(sw.PPO(**QUICK), steps=600)
-    assert more.train(tmp_path / "run", seed=3, quiet=True, resume=True).policy is not None
+    assert more.train(run.path, seed=3, quiet=True, resume=True).policy is not None
     free = planned.with_selector(sw.PPO(**QUICK), steps=100, target_kl=None)
     assert free.guide is None
 
 
-def test_what_cannot_start_from_a_plan_is_refused(planned: Run, tmp_path: Path) -> None:
+def test_what_cannot_start_from_a_plan_is_refused(planned: Run) -> None:
     with pytest.raises(DeclarationError, match="only a selector that learns by PPO can start"):
         planned.with_selector(sw.DQN())
     with pytest.raises(DeclarationError, match="steps is 0"):
@@ -136,7 +118,7 @@ def test_what_cannot_start_from_a_plan_is_refused(planned: Run, tmp_path: Path) 
     network = Network(rnn=RNN())
     recurrent = planned.with_selector(sw.PPO(network=network), steps=100)
     with pytest.raises(DeclarationError, match="recurrent network cannot start from a plan"):
-        recurrent.train(tmp_path / "run", quiet=True)
+        recurrent.train(quiet=True)
 
 
 # Observations with the task's state
@@ -213,7 +195,7 @@ class Watching(GetKey):
         return step.next_obs[:, KEY]
 
 
-def test_skills_see_what_they_saw(tmp_path: Path) -> None:
+def test_skills_see_what_they_saw() -> None:
     """Also reflexes, and the skills, masks and selectors of a hierarchy that is a skill."""
     asked = []
 
@@ -233,11 +215,11 @@ def test_skills_see_what_they_saw(tmp_path: Path) -> None:
 
     skills = [Watching(), Right(), Wait()]
     reflexes = [sw.Reflex(stays, 1, "stays")]
-    run = run_of(skills, reflexes=reflexes, selector=lambda obs: ["wait"] * len(obs))
+    run = run_of(*skills, reflexes=reflexes, selector=lambda obs: ["wait"] * len(obs))
     with pytest.warns(UserWarning, match="these skills have a memory: right"):
         first = run.plan(Mission(has_key, door_open), run.log_calls(1_500, seed=1))
     assert first.evaluate(10, quiet=True).success_rate == 1.0
-    trained = first.with_selector(sw.PPO(**QUICK), steps=200).train(tmp_path / "run", quiet=True)
+    trained = first.with_selector(sw.PPO(**QUICK), steps=200).train(quiet=True)
     score = trained.evaluate(10, quiet=True)
     assert score.success_rate is not None
     assert set(asked) == {(3,)}
@@ -247,7 +229,7 @@ def test_skills_see_what_they_saw(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_planner_guides_a_selector_that_is_trained(tmp_path: Path) -> None:
+def test_a_planner_guides_a_selector_that_is_trained() -> None:
     run = run_of()
     planner = Planner(run.log_calls(1_500, seed=1), TASK, skills=run.policy)
     guided = sw.Hierarchy(
@@ -258,17 +240,17 @@ def test_a_planner_guides_a_selector_that_is_trained(tmp_path: Path) -> None:
         selector=sw.PPO(**QUICK),
         guide=sw.Guide(planner, restrict=False, target_kl=0.1),
     )
-    trained = guided.train(tmp_path / "run", quiet=True, checkpoint_every=128)
-    rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    trained = guided.train(quiet=True, checkpoint_every=128)
+    rows = [json.loads(line) for line in (trained.path / "metrics.jsonl").read_text().splitlines()]
     assert all(np.isfinite(row["reference_kl"]) for row in rows if "reference_kl" in row)
-    assert guided.load(tmp_path / "run").policy.source() == trained.policy.source()
+    assert guided.load(trained.path).policy.source() == trained.policy.source()
     restricts = sw.Guide(planner)
     with pytest.raises(DeclarationError, match="has nothing to choose"):
         sw.Hierarchy(SPEC, run.hierarchy.skills, call_steps=None, guide=restricts)
 
 
 @pytest.mark.slow
-def test_a_guide_that_is_a_planner_also_chooses_lengths(tmp_path: Path) -> None:
+def test_a_guide_that_is_a_planner_also_chooses_lengths() -> None:
     class Go(sw.Skill):
         policy = always(2)
 
@@ -278,19 +260,19 @@ def test_a_guide_that_is_a_planner_also_chooses_lengths(tmp_path: Path) -> None:
     def declared(**how: Any) -> sw.Hierarchy:
         return sw.Hierarchy(SPEC, [Go(), Back()], call_steps=sw.Lengths(1, 2, 4), **how)
 
-    chance = declared(steps=64, selector=sw.PPO(**QUICK)).train(tmp_path / "chance", quiet=True)
+    chance = declared(steps=64, selector=sw.PPO(**QUICK)).train(quiet=True)
     log = chance.log_calls(1_500, seed=0)
     assert log.lengths == (1, 2, 4)
     task = Mission(door_open, at_four)
     planner = Planner(log, task, skills=chance.policy)
-    alone = declared(selector=planner).train(tmp_path / "alone", quiet=True)
+    alone = declared(selector=planner).train(quiet=True)
     assert max(alone.evaluate(5, quiet=True).lengths) > 0
     planned = chance.plan(task, log)
     assert planned.evaluate(10, quiet=True).success_rate == 1.0
     guided = declared(
         steps=200, selector=sw.PPO(**QUICK), guide=sw.Guide(planner, restrict=False, target_kl=0.1)
     )
-    guided.train(tmp_path / "guided", quiet=True)
+    guided.train(quiet=True)
     with pytest.raises(DeclarationError, match="has nothing to choose"):
         declared(guide=sw.Guide(planner))
     with pytest.raises(SkillweaveError, match="chooses the lengths 1, 2, 4, so write call_steps"):
@@ -316,7 +298,7 @@ def test_a_planner_that_guides_remembers_the_calls_that_were_made() -> None:
 
 
 @pytest.mark.slow
-def test_goals_that_observations_hold_are_learnt(tmp_path: Path) -> None:
+def test_goals_that_observations_hold_are_learnt() -> None:
     """A selector that starts from a plan starts with many goals."""
 
     class Aim(gym.Wrapper):  # type: ignore[type-arg]
@@ -346,7 +328,7 @@ def test_goals_that_observations_hold_are_learnt(tmp_path: Path) -> None:
     declared = sw.Hierarchy(
         spec, [Left(), Right()], call_steps=None, selector=lambda obs: ["left"] * len(obs)
     )
-    run = declared.train(tmp_path / "run", quiet=True)
+    run = declared.train(quiet=True)
     log: CallLog = run.log_calls(3_000)
     planned = run.plan(GoalTask(near, columns=(1,)), log, features=[0])
     assert planned.evaluate(20, quiet=True).success_rate == 1.0

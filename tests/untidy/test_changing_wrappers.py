@@ -3,11 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from timed import SMALL, Timed
 
 import skillweave as sw
 from skillweave.errors import EnvError
-
-SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
 
 
 class Own(gym.wrappers.NormalizeObservation):
@@ -29,7 +28,7 @@ def test_they_are_refused_before_anything_is_trained(wrapper, instead, tmp_path)
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
 
 
-def test_statistics_that_no_longer_change_are_fine(tmp_path):
+def test_statistics_that_no_longer_change_are_fine():
     def frozen(env):
         env = gym.wrappers.NormalizeObservation(env)
         env.obs_rms.mean, env.obs_rms.var = np.full(4, 0.1), np.full(4, 0.5)
@@ -37,7 +36,7 @@ def test_statistics_that_no_longer_change_are_fine(tmp_path):
         return env
 
     spec = sw.EnvSpec("CartPole-v1", wrappers=(frozen,))
-    run = sw.train_agent(spec, SMALL, 256, tmp_path / "run", quiet=True)
+    run = sw.train_agent(spec, SMALL, 256, quiet=True)
     assert run.evaluate(8, num_envs=1).returns == run.evaluate(8, num_envs=8).returns
 
 
@@ -53,29 +52,21 @@ class Scaled(gym.ObservationWrapper):
         return (obs / self.most).astype(np.float32)
 
 
-class Harder(gym.Env):
+class Harder(Timed):
     """Starts further away with each episode."""
 
-    observation_space = gym.spaces.Box(-100, 100, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
     episode = 0
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.episode, self.t = self.episode + 1, 0
-        return np.array([self.episode], np.float32), {}
-
-    def step(self, action):
-        self.t += 1
-        return np.array([self.t], np.float32), 1.0, False, self.t == 5, {}
+    def show(self):
+        self.episode += self.t == 0
+        return np.array([self.t or self.episode], np.float32)
 
 
-class Unseeded(Harder):
-    """Draws its start from a generator of its own that no seed reaches."""
+class Unseeded(Timed):
+    """Draws what it shows from a generator of its own that no seed reaches."""
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.random.default_rng().normal(size=1).astype(np.float32), {}
+    def show(self):
+        return np.random.default_rng().normal(size=1).astype(np.float32)
 
 
 @pytest.mark.parametrize(

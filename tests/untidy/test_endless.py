@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from timed import Timed
 
 import skillweave as sw
 from skillweave.envs import checks
@@ -11,23 +12,12 @@ from skillweave.training import evaluation, stage_log
 SMALL = sw.PPO(num_envs=2, n_steps=32, batch_size=32, update_epochs=1, network=sw.Network((8,)))
 
 
-class Endless(gym.Env):
-    observation_space = gym.spaces.Box(-50, 50, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-    own_limit = None
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.t += 1
-        return np.zeros(1, np.float32), 1.0, False, self.t == self.own_limit, {}
+class Endless(Timed):
+    length = None
 
 
-class Limited(Endless):
-    own_limit = 50
+class Limited(Timed):
+    length = 50
 
 
 @pytest.fixture(autouse=True)
@@ -50,16 +40,16 @@ class Go(sw.Skill):
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("learn", ["apart", "together"])
-def test_it_is_said_once_in_a_run(learn, workers, tmp_path, capsys):
+def test_it_is_said_once_in_a_run(learn, workers, capsys):
     spec = sw.EnvSpec(Endless, workers=workers)
     how = {"algorithm": SMALL, "selector": SMALL, "learn": learn}
-    sw.Hierarchy(spec, [Go()], steps=400 * (1 + (learn == "apart")), **how).train(tmp_path / "run")
+    sw.Hierarchy(spec, [Go()], steps=400 * (1 + (learn == "apart")), **how).train()
     assert said(capsys) == 1
 
 
-def test_a_quiet_run_says_it_as_a_python_warning(tmp_path):
+def test_a_quiet_run_says_it_as_a_python_warning():
     with pytest.warns(UserWarning, match="steps without an end"):
-        sw.train_agent(sw.EnvSpec(Endless, workers=1), SMALL, 400, tmp_path / "run", quiet=True)
+        sw.train_agent(sw.EnvSpec(Endless, workers=1), SMALL, 400, quiet=True)
 
 
 @pytest.mark.parametrize(
@@ -70,13 +60,13 @@ def test_a_quiet_run_says_it_as_a_python_warning(tmp_path):
     ],
     ids=["its own", "a longer one of a wrapper"],
 )
-def test_a_limit_of_any_kind_counts(spec, tmp_path, capsys):
-    sw.train_agent(spec, SMALL, 1200, tmp_path / "run")
+def test_a_limit_of_any_kind_counts(spec, capsys):
+    sw.train_agent(spec, SMALL, 1200)
     assert said(capsys) == 0
 
 
-def test_evaluations_have_a_limit_of_their_own(tmp_path):
-    run = sw.train_agent(sw.EnvSpec(Endless, workers=1), SMALL, 128, tmp_path / "run", quiet=True)
+def test_evaluations_have_a_limit_of_their_own():
+    run = sw.train_agent(sw.EnvSpec(Endless, workers=1), SMALL, 128, quiet=True)
     found = run.evaluate(3)
     assert (found.lengths, found.cut) == ((100,) * 3, 3)
     assert "3 never ended and were cut after 100 steps (max_steps)" in str(found)
@@ -111,26 +101,26 @@ def test_an_evaluation_with_a_limit_or_ends_says_nothing(monkeypatch):
     assert sw.evaluate(policy, Limited, episodes=1).lengths == (50,)
 
 
-def test_a_longer_limit_that_is_known_is_kept(tmp_path):
+def test_a_longer_limit_that_is_known_is_kept():
     policy = sw.from_function(lambda obs: np.zeros(len(obs), int))
     spec = sw.EnvSpec(Endless, wrappers=(lambda e: gym.wrappers.TimeLimit(e, 300),))
     assert sw.evaluate(policy, spec, episodes=2).lengths == (300, 300)
 
 
-def test_evaluations_that_take_longer_than_training_are_said_once(tmp_path, capsys, monkeypatch):
+def test_evaluations_that_take_longer_than_training_are_said_once(capsys, monkeypatch):
     monkeypatch.setattr(stage_log, "SLOW_SECONDS", 0.0)
     spec = sw.EnvSpec(Endless, workers=1)
-    sw.train_agent(spec, SMALL, 256, tmp_path / "run", eval_every=64, eval_episodes=20)
+    sw.train_agent(spec, SMALL, 256, eval_every=64, eval_episodes=20)
     assert capsys.readouterr().err.count("a larger eval_every") == 1
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*steps without an end")
-def test_evaluations_during_training_and_after_it_end(tmp_path):
+def test_evaluations_during_training_and_after_it_end():
     """Choosing between greedy and sampling plays no episode longer than those of training."""
     how = {"algorithm": SMALL, "selector": SMALL, "learn": "together"}
     hierarchy = sw.Hierarchy(sw.EnvSpec(Endless, workers=1), [Go()], steps=640, **how)
-    run = hierarchy.train(tmp_path / "run", eval_every=320, eval_episodes=2, quiet=True)
+    run = hierarchy.train(eval_every=320, eval_episodes=2, quiet=True)
     (stage,) = run.info()["stages"]
     assert stage["final"]["eval_return"] == 100.0
     assert stage["evaluation_steps"] <= 3 * 200 + 4 * 20 * 640 // SMALL.num_envs

@@ -2,9 +2,9 @@
 
 import sys
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from timed import Timed
 
 import skillweave as sw
 from skillweave.errors import EnvError, PolicyError, SkillError
@@ -13,18 +13,11 @@ SMALL = sw.PPO(num_envs=2, n_steps=8, batch_size=16, update_epochs=1, network=sw
 WHERE = r".* SystemExit: enough \(test_exits\.py, line \d+\)"
 
 
-class Ramp(gym.Env):
-    observation_space = gym.spaces.Box(-10.0, 10.0, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
+class Ramp(Timed):
+    length = 8
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.t += 1
-        return np.array([self.t], np.float32), 1.0, self.t >= 8, False, {}
+    def show(self):
+        return np.array([self.t], np.float32)
 
 
 def leave(*_):
@@ -32,7 +25,7 @@ def leave(*_):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_in_action_masks(workers, tmp_path):
+def test_in_action_masks(workers):
     class Masked(Ramp):
         def action_masks(self):
             if self.t == 3:
@@ -41,7 +34,7 @@ def test_in_action_masks(workers, tmp_path):
 
     spec = sw.EnvSpec(Masked, engine="sync", workers=workers)
     with pytest.raises(EnvError) as found:
-        sw.train_agent(spec, SMALL, 64, tmp_path / "run", quiet=True)
+        sw.train_agent(spec, SMALL, 64, quiet=True)
     assert found.match(r"environment 0, step 3 of its episode: action_masks\(\) raised" + WHERE)
 
 
@@ -61,16 +54,16 @@ SKILLS = {
 
 @pytest.mark.parametrize("learn", ["together", "apart"])
 @pytest.mark.parametrize("methods", SKILLS.values(), ids=SKILLS)
-def test_in_a_function_of_a_skill(methods, learn, tmp_path):
+def test_in_a_function_of_a_skill(methods, learn):
     with pytest.raises(sw.SkillweaveError) as found:
         sw.Hierarchy(
             Ramp, [skill(**methods), Stay()], algorithm=SMALL, selector=SMALL, steps=64, learn=learn
-        ).train(tmp_path / "run", quiet=True)
+        ).train(quiet=True)
     assert found.match("skill 'leaves'")
     assert found.match(r"(?s).* raised" + WHERE)
 
 
-def test_in_a_function_that_answers_once(tmp_path):
+def test_in_a_function_that_answers_once():
     """Functions are called a second time, for other numbers of environments."""
 
     def later(self, obs):
@@ -81,7 +74,7 @@ def test_in_a_function_that_answers_once(tmp_path):
     with pytest.raises(SkillError, match=r"skill 'leaves': initiation\(\)") as found:
         sw.Hierarchy(
             Ramp, [skill(initiation=later), Stay()], algorithm=SMALL, selector=SMALL, steps=64
-        ).train(tmp_path / "run", quiet=True)
+        ).train(quiet=True)
     assert found.match(WHERE)
 
 
@@ -97,12 +90,12 @@ AROUND = {
 
 
 @pytest.mark.parametrize("how", AROUND.values(), ids=AROUND)
-def test_in_a_function_of_a_hierarchy(how, tmp_path):
+def test_in_a_function_of_a_hierarchy(how):
     settings = {"algorithm": SMALL, "selector": SMALL, "steps": 64}
 
     def train():
         declared = sw.Hierarchy(Ramp, [Stay()], **settings | how())
-        declared.train(tmp_path / "run", quiet=True)
+        declared.train(quiet=True)
 
     with pytest.raises(sw.SkillweaveError, match=r"raised" + WHERE):
         train()

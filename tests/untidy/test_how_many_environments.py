@@ -5,6 +5,7 @@ import json
 import gymnasium as gym
 import numpy as np
 import pytest
+from timed import Timed
 
 import skillweave as sw
 from skillweave.errors import EnvError
@@ -15,11 +16,10 @@ def small(num_envs: int) -> sw.PPO:
     return sw.PPO(num_envs=num_envs, n_steps=64, batch_size=32, network=sw.Network((8,)))
 
 
-class Counted(gym.Env):
-    """Counts its instances; more than are allowed cannot be made."""
+class Counted(Timed):
+    """Counts its instances; more than are allowed cannot be made. It pays its action."""
 
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
     alive = most = 0
     allowed = 10**6
     begun = 0
@@ -35,15 +35,13 @@ class Counted(gym.Env):
         Counted.alive -= self.open
         self.open = False
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return np.zeros(2, np.float32), {}
+    def show(self):
+        return np.full(2, self.t / 10, np.float32)
 
     def step(self, action):
         Counted.begun += 1
-        self.t += 1
-        return np.full(2, self.t / 10, np.float32), float(action), False, self.t == 10, {}
+        obs, _, *rest = super().step(action)
+        return obs, float(action), *rest
 
     def render(self):
         return np.zeros((16, 16, 3), np.uint8)
@@ -86,24 +84,24 @@ def test_a_simulator_of_which_there_can_be_one_works_in_every_mode(learn, tmp_pa
     assert (Counted.most, Counted.alive) == (1, 0)
 
 
-def test_more_than_can_be_made_names_the_setting(tmp_path):
+def test_more_than_can_be_made_names_the_setting():
     Counted.allowed = 3
     with pytest.raises(EnvError, match=r"3 could be made.*num_envs=3"):
-        hierarchy("together", 8).train(tmp_path / "run", quiet=True)
+        hierarchy("together", 8).train(quiet=True)
     assert (Counted.begun, Counted.alive) == (0, 0)
 
 
-def test_where_two_are_needed_one_is_refused_before_anything_is_trained(tmp_path):
+def test_where_two_are_needed_one_is_refused_before_anything_is_trained():
     Counted.allowed = 1
     with pytest.raises(EnvError, match=r"port 2000 is in use.*leave eval_every out"):
-        hierarchy("apart", 1).train(tmp_path / "run", eval_every=200, quiet=True)
+        hierarchy("apart", 1).train(eval_every=200, quiet=True)
     assert (Counted.begun, Counted.alive) == (0, 0)
 
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("learn", ["apart", "together"])
-def test_evaluations_make_no_more_than_training(learn, tmp_path):
-    run = hierarchy(learn, 2).train(tmp_path / "run", quiet=True)
+def test_evaluations_make_no_more_than_training(learn):
+    run = hierarchy(learn, 2).train(quiet=True)
     run.evaluate(20)
     run.report(episodes=5, films=0)
     assert Counted.most == 2
@@ -127,14 +125,14 @@ class Starts(Counted):
         return obs, self.start, *rest
 
 
-def test_members_of_a_population_are_compared_in_no_more_than_they_train_in(tmp_path):
+def test_members_of_a_population_are_compared_in_no_more_than_they_train_in():
     """Seven episodes: the same starts for all members, in any number of environments."""
     found = []
     for n in (1, 2, 16):
         Counted.alive = Counted.most = 0
         spec = sw.EnvSpec(Starts, engine="sync", workers=1)
         how = Evolution(population=2, generations=2, episodes=7)
-        run = sw.train_agent(spec, small(n), 256 * n, tmp_path / f"{n}", evolve=how, quiet=True)
+        run = sw.train_agent(spec, small(n), 256 * n, evolve=how, quiet=True)
         lines = (run.path / "lineage.jsonl").read_text().splitlines()
         found.append([json.loads(line)["fitness"] for line in lines])
         assert Counted.most == 2 * n + min(n, 7)
@@ -157,40 +155,34 @@ def test_a_population_of_a_simulator_of_which_there_can_be_one_is_refused_at_onc
     assert not (tmp_path / "run").exists()
 
 
-def test_a_population_that_needs_more_than_can_be_made_names_its_settings(tmp_path):
+def test_a_population_that_needs_more_than_can_be_made_names_its_settings():
     Counted.allowed = 4
     with pytest.raises(EnvError, match=r"here 8 of them to train in.*\(population\) and num"):
         sw.train_agent(
-            sw.EnvSpec(Counted, workers=1), small(2), 600, tmp_path / "run", quiet=True,
+            sw.EnvSpec(Counted, workers=1), small(2), 600, quiet=True,
             evolve=Evolution(population=4, episodes=3),
         )  # fmt: skip
     assert (Counted.begun, Counted.alive) == (0, 0)
 
 
 @pytest.mark.slow
-def test_evaluations_during_training_make_as_many_again(tmp_path):
+def test_evaluations_during_training_make_as_many_again():
     how = {"eval_every": 200, "eval_episodes": 7, "quiet": True}
-    run = hierarchy("together", 2).train(tmp_path / "run", **how)
+    run = hierarchy("together", 2).train(**how)
     assert Counted.most == 4
     assert "eval_return" in run.info()["stages"][0]["final"]
 
 
-def test_periodic_evaluations_play_all_episodes_in_few_environments(tmp_path):
+def test_periodic_evaluations_play_all_episodes_in_few_environments():
     """Seven episodes in two environments: as many different starts."""
     starts: list[float] = []
 
-    class Starts(Counted):
-        def reset(self, *, seed=None, options=None):
-            obs, info = super().reset(seed=seed)
-            self.start = float(self.np_random.random())
-            return obs, info
-
+    class Told(Starts):
         def step(self, action):
-            obs, _, *rest = super().step(action)
             starts.append(self.start)
-            return obs, self.start, *rest
+            return super().step(action)
 
-    spec = sw.EnvSpec(Starts, workers=1)
+    spec = sw.EnvSpec(Told, workers=1)
     told: list[float] = []
 
     def watch(event):
@@ -198,7 +190,7 @@ def test_periodic_evaluations_play_all_episodes_in_few_environments(tmp_path):
             told.append(event.metrics["eval_return"])
 
     sw.train_agent(
-        spec, small(2), 400, tmp_path / "run", eval_every=128, eval_episodes=7, callback=watch,
+        spec, small(2), 400, eval_every=128, eval_episodes=7, callback=watch,
         quiet=True,
     )  # fmt: skip
     assert len(told) >= 3

@@ -5,16 +5,17 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from timed import Timed
 
 import skillweave as sw
 
 SMALL = sw.PPO(num_envs=2, n_steps=64, batch_size=64, update_epochs=1, network=sw.Network((4,)))
 
 
-class Camera(gym.Env):
+class Camera(Timed):
     """Shows random pictures whose values lie between two numbers."""
 
-    action_space = gym.spaces.Discrete(2)
+    length = 40
 
     def __init__(self, bounds, values, dtype=np.float32, part=False):
         self.values, self.dtype, self.part = values, dtype, part
@@ -22,26 +23,17 @@ class Camera(gym.Env):
         speed = gym.spaces.Box(-1, 1, (2,), np.float32)
         self.observation_space = gym.spaces.Dict(eye=image, speed=speed) if part else image
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self.see(), {}
-
-    def see(self):
+    def show(self):
         image = self.np_random.uniform(*self.values, (8, 8, 3)).astype(self.dtype)
         return {"eye": image, "speed": np.zeros(2, np.float32)} if self.part else image
 
-    def step(self, action):
-        self.t += 1
-        return self.see(), 1.0, False, self.t == 40, {}
 
-
-def train(folder, *how, quiet=False, workers=1, **more):
+def train(*how, quiet=False, workers=1, **more):
     def camera():
         return Camera(*how, **more)
 
     spec = sw.EnvSpec(camera, engine="sync", workers=workers)
-    return sw.train_agent(spec, SMALL, 256, folder, quiet=quiet, eval_every=128, eval_episodes=2)
+    return sw.train_agent(spec, SMALL, 256, quiet=quiet, eval_every=128, eval_episodes=2)
 
 
 BEYOND = {
@@ -57,8 +49,8 @@ NARROW = {
 
 
 @pytest.mark.parametrize(("bounds", "values", "says"), BEYOND.values(), ids=BEYOND)
-def test_values_beyond_the_bounds_are_said_once(bounds, values, says, tmp_path, capsys):
-    train(tmp_path / "run", bounds, values)
+def test_values_beyond_the_bounds_are_said_once(bounds, values, says, capsys):
+    train(bounds, values)
     said = capsys.readouterr().err
     assert said.count("is an image with bounds") == 1
     assert f"camera: the observation is an image with bounds {says}" in " ".join(said.split())
@@ -66,21 +58,21 @@ def test_values_beyond_the_bounds_are_said_once(bounds, values, says, tmp_path, 
 
 
 @pytest.mark.parametrize(("bounds", "values", "says"), NARROW.values(), ids=NARROW)
-def test_values_that_hardly_use_the_bounds_are_said_once(bounds, values, says, tmp_path, capsys):
-    train(tmp_path / "run", bounds, values)
+def test_values_that_hardly_use_the_bounds_are_said_once(bounds, values, says, capsys):
+    train(bounds, values)
     said = " ".join(capsys.readouterr().err.split())
     assert said.count("is an image with bounds") == 1
     assert f"but its first 64 observations had values {says}" in said
 
 
-def test_a_part_of_an_observation_is_named_and_processes_say_it_once(tmp_path, capsys):
-    train(tmp_path / "run", (0, 1), (0, 255), workers=2, part=True)
+def test_a_part_of_an_observation_is_named_and_processes_say_it_once(capsys):
+    train((0, 1), (0, 255), workers=2, part=True)
     said = " ".join(capsys.readouterr().err.split())
     assert said.count("camera: the observation (eye) is an image with bounds") == 1
 
 
-def test_bytes_are_looked_at_too(tmp_path, capsys):
-    train(tmp_path / "run", (0, 255), (0, 2), dtype=np.uint8)
+def test_bytes_are_looked_at_too(capsys):
+    train((0, 255), (0, 2), dtype=np.uint8)
     said = " ".join(capsys.readouterr().err.split())
     assert "had values from 0 to 1 alone" in said
 
@@ -100,7 +92,7 @@ FITS = {
 
 
 @pytest.mark.parametrize(("bounds", "values"), FITS.values(), ids=FITS)
-def test_values_that_fit_are_silent(bounds, values, tmp_path):
+def test_values_that_fit_are_silent(bounds, values):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        train(tmp_path / "run", bounds, values, quiet=True)
+        train(bounds, values, quiet=True)

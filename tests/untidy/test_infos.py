@@ -5,41 +5,34 @@ from collections import Counter, OrderedDict
 import gymnasium as gym
 import numpy as np
 import pytest
+from timed import SMALL, Timed
 
 import skillweave as sw
 from skillweave.errors import SkillError
 from skillweave.evolution import Evolution
 
-SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
 READ: list[int] = []
 """Rows that a skill has read."""
 ABSENT = type  # the same in every copy
 """Stands for a key that an environment does not give."""
 
 
-class Telling(gym.Env):
+class Telling(Timed):
     """Shows a number, and tells the value of that number in its info."""
-
-    action_space = gym.spaces.Discrete(2)
 
     def __init__(self, values) -> None:
         self.values = values
         self.observation_space = gym.spaces.Box(0, len(values), (1,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self.show(), {}
 
     def show(self):
         self.i = int(self.np_random.integers(len(self.values)))
         return np.array([self.i], np.float32)
 
     def step(self, action):
-        self.t += 1
-        obs, value = self.show(), self.values[self.i]
+        *step, _ = super().step(action)
+        value = self.values[self.i]
         info = {} if value is ABSENT else {"told": value}
-        return obs, 0.0, False, self.t == 10, {"always": self.i} | info
+        return *step, {"always": self.i} | info
 
 
 def telling(values) -> sw.EnvSpec:
@@ -93,15 +86,15 @@ KINDS = {
 
 
 @pytest.mark.parametrize("values", KINDS.values(), ids=KINDS)
-def test_each_environment_is_read_exactly(values, tmp_path):
+def test_each_environment_is_read_exactly(values):
     spec = telling(values)
     READ.clear()
     agents = {"algorithm": SMALL, "selector": SMALL}
-    sw.Hierarchy(spec, [Reads(values)], steps=256, **agents).train(tmp_path / "run", quiet=True)
+    sw.Hierarchy(spec, [Reads(values)], steps=256, **agents).train(quiet=True)
     assert len(READ) > 50
 
 
-def test_dicts_of_any_kind_are_read_by_their_keys(tmp_path):
+def test_dicts_of_any_kind_are_read_by_their_keys():
     class Nested(sw.Skill):
         max_steps = 5
 
@@ -113,16 +106,14 @@ def test_dicts_of_any_kind_are_read_by_their_keys(tmp_path):
     READ.clear()
     kinds = [OrderedDict(x=0), {"x": 1.0}, Counter(x=2)]
     agents = {"algorithm": SMALL, "selector": SMALL}
-    sw.Hierarchy(telling(kinds), [Nested()], steps=256, **agents).train(
-        tmp_path / "run", quiet=True
-    )
+    sw.Hierarchy(telling(kinds), [Nested()], steps=256, **agents).train(quiet=True)
     assert READ
 
 
-def test_members_of_a_population_may_tell_other_kinds(tmp_path):
+def test_members_of_a_population_may_tell_other_kinds():
     values = [0, 2**60 + 1, 0.5, {"a": 1}, np.arange(3), "goal", ABSENT]
     evolve = Evolution(population=2, generations=2)
-    sw.train_agent(telling(values), SMALL, 1_500, tmp_path / "run", evolve=evolve, quiet=True)
+    sw.train_agent(telling(values), SMALL, 1_500, evolve=evolve, quiet=True)
 
 
 class Scores(sw.Skill):
@@ -141,26 +132,22 @@ class Doubles(Scores):
     ("skill", "other"),
     [(Scores(), None), (Scores(), "goal"), (Doubles(), None), (Doubles(), {"goal": 1})],
 )
-def test_a_key_that_is_read_must_hold_numbers_in_all_environments(skill, other, tmp_path):
+def test_a_key_that_is_read_must_hold_numbers_in_all_environments(skill, other):
     spec = telling([1.5, other])
     with pytest.raises(SkillError) as caught:
-        sw.Hierarchy(spec, [skill], steps=256, algorithm=SMALL, selector=SMALL).train(
-            tmp_path / "run", quiet=True
-        )
+        sw.Hierarchy(spec, [skill], steps=256, algorithm=SMALL, selector=SMALL).train(quiet=True)
     said = str(caught.value)
     assert "info['told'] is " in said
     assert f"{other!r} of environment" in said or "a dict of 'goal'" in said
 
 
-def test_a_key_that_nobody_gives_is_named(tmp_path):
+def test_a_key_that_nobody_gives_is_named():
     spec = telling([ABSENT])
     with pytest.raises(SkillError, match=r"no environment set this key .*'always'"):
-        sw.Hierarchy(spec, [Scores()], steps=256, algorithm=SMALL, selector=SMALL).train(
-            tmp_path / "run", quiet=True
-        )
+        sw.Hierarchy(spec, [Scores()], steps=256, algorithm=SMALL, selector=SMALL).train(quiet=True)
 
 
-def test_a_success_that_is_not_known_yet_is_no_failure(tmp_path):
+def test_a_success_that_is_not_known_yet_is_no_failure():
     class Late(Telling):
         """Says None until the last step, when some have succeeded."""
 
@@ -182,11 +169,11 @@ def test_a_success_that_is_not_known_yet_is_no_failure(tmp_path):
     assert found.success_rate == np.mean(np.array(found.lengths) > 5)
 
 
-class OneBuffer(gym.Env):
+class OneBuffer(Timed):
     """All its instances show the same array, which each of them fills in its own step."""
 
     shared = np.zeros(2, np.float32)
-    action_space = gym.spaces.Discrete(2)
+    length = 7
 
     def __init__(self, parts: bool) -> None:
         box = gym.spaces.Box(-1e6, 1e6, (2,), np.float32)
@@ -196,21 +183,18 @@ class OneBuffer(gym.Env):
         )
 
     def show(self):
+        if self.t == 0:
+            self.number = int(self.np_random.integers(1000))
         self.shared[:] = self.number, self.t
         return {"own": self.shared, "t": self.t} if self.parts else self.shared
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.number, self.t = int(self.np_random.integers(1000)), 0
-        return self.show(), {}
-
     def step(self, action):
-        self.t += 1
-        return self.show(), 0.0, False, self.t == 7, {"number": self.number, "t": self.t}
+        *step, _ = super().step(action)
+        return *step, {"number": self.number, "t": self.t}
 
 
 @pytest.mark.parametrize("parts", [False, True], ids=["box", "dict"])
-def test_instances_may_share_one_buffer_for_observations(parts, tmp_path):
+def test_instances_may_share_one_buffer_for_observations(parts):
     seen = []
 
     class Watches(sw.Skill):
@@ -226,7 +210,5 @@ def test_instances_may_share_one_buffer_for_observations(parts, tmp_path):
             return np.zeros(len(step.obs))
 
     spec = sw.EnvSpec(OneBuffer, kwargs={"parts": parts}, workers=1)
-    sw.Hierarchy(spec, [Watches()], steps=256, algorithm=SMALL, selector=SMALL).train(
-        tmp_path / "run", quiet=True
-    )
+    sw.Hierarchy(spec, [Watches()], steps=256, algorithm=SMALL, selector=SMALL).train(quiet=True)
     assert max(seen) > 1

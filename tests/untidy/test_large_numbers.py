@@ -5,17 +5,14 @@ import re
 import gymnasium as gym
 import numpy as np
 import pytest
+from timed import SMALL, Timed
 
 import skillweave as sw
 from skillweave.errors import EnvError
 
-SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
 
-
-class Clock(gym.Env):
+class Clock(Timed):
     """Shows how late it is, as numbers of some size."""
-
-    action_space = gym.spaces.Discrete(2)
 
     def __init__(self, first: float, dtype, parts: bool) -> None:
         most = np.inf if np.dtype(dtype).kind == "f" else np.iinfo(dtype).max
@@ -28,32 +25,23 @@ class Clock(gym.Env):
         obs = np.array([self.first + self.t, self.t], self.dtype)
         return {"own": obs} if self.parts else obs
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self.show(), {}
 
-    def step(self, action):
-        self.t += 1
-        return self.show(), 1.0, False, self.t == 9, {}
-
-
-def train(first, dtype, parts, path, quiet=True):
+def train(first, dtype, parts, quiet=True):
     spec = sw.EnvSpec(lambda: Clock(first, dtype, parts), workers=1)
-    return sw.train_agent(spec, SMALL, 256, path, quiet=quiet)
+    return sw.train_agent(spec, SMALL, 256, quiet=quiet)
 
 
 @pytest.mark.parametrize("parts", [False, True], ids=["box", "dict"])
-def test_numbers_beyond_float32_are_refused(parts, tmp_path):
+def test_numbers_beyond_float32_are_refused(parts):
     with pytest.raises(EnvError, match=r"1 of 2 numbers.*larger than 3.4e\+38.*float32"):
-        train(1e300, np.float64, parts, tmp_path / "run")
+        train(1e300, np.float64, parts)
 
 
 @pytest.mark.parametrize("parts", [False, True], ids=["box", "dict"])
 @pytest.mark.parametrize("dtype", [np.float64, np.int64, np.uint32])
-def test_numbers_that_float32_cannot_tell_apart_are_said_once(parts, dtype, tmp_path, capsys):
+def test_numbers_that_float32_cannot_tell_apart_are_said_once(parts, dtype, capsys):
     seconds = 1.7e9  # since 1970
-    train(seconds, dtype, parts, tmp_path / "run", quiet=False)
+    train(seconds, dtype, parts, quiet=False)
     said = capsys.readouterr().err
     assert re.search(rf"1,700,000,\d\d\d, in {np.dtype(dtype)}.* 128 apart", said)
     assert said.count("128 apart") == 1

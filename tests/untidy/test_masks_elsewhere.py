@@ -5,12 +5,12 @@ import re
 import gymnasium as gym
 import numpy as np
 import pytest
+from timed import SMALL
 
 import skillweave as sw
 from skillweave.errors import DeclarationError, EnvError
 from skillweave.export.runner import Runner
 
-SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
 ILLEGAL: list[int] = []
 """Forbidden actions that were taken."""
 
@@ -72,12 +72,12 @@ def spec(where, several=False) -> sw.EnvSpec:
 
 @pytest.mark.parametrize("several", [False, True], ids=["discrete", "multidiscrete"])
 @pytest.mark.parametrize("where", ["info", "observation", "method"])
-def test_a_mask_is_used_wherever_it_is(where, several, tmp_path):
+def test_a_mask_is_used_wherever_it_is(where, several):
     ILLEGAL.clear()
     hierarchy = sw.Hierarchy(
         spec(where, several), [Any()], steps=256, algorithm=SMALL, selector=SMALL
     )
-    run = hierarchy.train(tmp_path / "run", quiet=True)
+    run = hierarchy.train(quiet=True)
     run.evaluate(5, deterministic=False)
     env, player = Slots(where, several), run.player(deterministic=False)
     obs, info = env.reset(seed=1)
@@ -109,8 +109,8 @@ def test_an_export_reads_the_mask_of_the_observation(tmp_path):
     ("where", "says"),
     [("another key", r"info\['legal_actions'\]"), ("another method", "its get_action_mask")],
 )
-def test_what_looks_like_a_mask_and_is_not_used_is_said_once(where, says, tmp_path, capsys):
-    sw.train_agent(spec(where), SMALL, 256, tmp_path / "run")
+def test_what_looks_like_a_mask_and_is_not_used_is_said_once(where, says, capsys):
+    sw.train_agent(spec(where), SMALL, 256)
     said = capsys.readouterr().err
     assert re.search(f"{says} looks like an action mask", said)
     assert said.count("looks like an action mask") == 1
@@ -156,23 +156,23 @@ MASKS = {
 
 @pytest.mark.parametrize("kind", [Told, Asked])
 @pytest.mark.parametrize("mask", MASKS.values(), ids=MASKS)
-def test_masks_may_be_given_in_many_ways(kind, mask, tmp_path):
+def test_masks_may_be_given_in_many_ways(kind, mask):
     ILLEGAL.clear()
     spec = sw.EnvSpec(lambda: kind(mask), workers=1)
-    run = sw.train_agent(spec, SMALL, 256, tmp_path / "run", quiet=True)
+    run = sw.train_agent(spec, SMALL, 256, quiet=True)
     run.evaluate(3)
     assert mask is MASKS["None, for all"] or not ILLEGAL
 
 
 @pytest.mark.parametrize("kind", [Told, Asked])
 @pytest.mark.parametrize("mask", [[1, 0], "all", np.ones(7)])
-def test_a_mask_that_is_none_names_environment_and_step(kind, mask, tmp_path):
+def test_a_mask_that_is_none_names_environment_and_step(kind, mask):
     spec = sw.EnvSpec(lambda: kind(lambda env: mask), workers=1)
     with pytest.raises(EnvError, match=r"environment 0, step 0 .*6 in all"):
-        sw.train_agent(spec, SMALL, 256, tmp_path / "run", quiet=True)
+        sw.train_agent(spec, SMALL, 256, quiet=True)
 
 
-def test_where_nothing_is_chosen_masks_are_not_asked_for(tmp_path):
+def test_where_nothing_is_chosen_masks_are_not_asked_for():
     def fails(env):
         raise NotImplementedError
 
@@ -183,7 +183,7 @@ def test_where_nothing_is_chosen_masks_are_not_asked_for(tmp_path):
             return super().step(0)
 
     spec = sw.EnvSpec(lambda: Moves(fails, box), workers=1)
-    sw.train_agent(spec, SMALL, 64, tmp_path / "run", quiet=True)
+    sw.train_agent(spec, SMALL, 64, quiet=True)
 
 
 @pytest.mark.parametrize("mask", [[1, 0], "all", np.zeros(6)])
@@ -198,22 +198,20 @@ def test_a_player_is_not_given_a_wrong_mask(mask):
 
 
 @pytest.mark.parametrize("where", ["info", "observation", "method"])
-def test_forbidden_actions_are_not_tried_either_to_measure_speed(where, tmp_path):
+def test_forbidden_actions_are_not_tried_either_to_measure_speed(where):
     class Strict(Slots):
         def step(self, action):
             if not self.free[action]:
                 raise ValueError("forbidden")
             return super().step(action)
 
-    sw.train_agent(lambda: Strict(where), SMALL, 64, tmp_path / "run", quiet=True)
+    sw.train_agent(lambda: Strict(where), SMALL, 64, quiet=True)
 
 
-def test_a_method_that_fails_is_named(tmp_path):
+def test_a_method_that_fails_is_named():
     class Broken(Slots):
         def action_masks(self):
             raise ValueError("no board")
 
     with pytest.raises(EnvError, match=r"action_masks\(\) raised ValueError: no board"):
-        sw.train_agent(
-            sw.EnvSpec(lambda: Broken("none"), workers=1), SMALL, 256, tmp_path / "run", quiet=True
-        )
+        sw.train_agent(sw.EnvSpec(lambda: Broken("none"), workers=1), SMALL, 256, quiet=True)
