@@ -521,44 +521,37 @@ class Hierarchy(Choices, Policy):
             end[elapsed >= memory["length"][rows]] = LIMIT
         end[elapsed >= self._limits[running]] = LIMIT
         own = own_step(step)
+
+        def seen(i: int, mine: Array) -> Step:
+            """Return the step as skill ``i`` sees it in ``rows[mine]``."""
+            goal = self.goal_of(memory, i, rows[mine])
+            return part_of(own, elapsed[mine], mine, self.skills[i].max_steps, goal)
+
         for i, mine in _by_skill(running):
-            if i in self._asked:
-                self._observe_skill(memory, i, rows, mine, elapsed, own, end)
+            if i not in self._asked:
+                continue
+            skill, at, part = self.skills[i], rows[mine], seen(i, mine)
+            if skill.policy.watches:
+                skill.policy.observe(memory[str(i)], at, part)
+                if skill.policy.restricts:
+                    end[mine[skill.policy.stuck(memory[str(i)], at, part.next_obs)]] = LIMIT
+            if skill.termination is not None:
+                end[mine[self.ask(skill.termination, part, at, skill.path, "termination")]] = OWN
         if self.interruption is not None:
             self._interrupt(self.interruption, memory, rows, step, end)
         end_with_episode(end, step.terminated | step.truncated)
         memory["end"][rows] = end
-        if any(who.ends_matter for who in self._ready.values()):
-            succeeded = self._succeeded(memory, rows, own, running, elapsed, end)
-            for name, who in self._ready.items():
-                who.watch(memory[name], rows, step, LastCall(running, end, succeeded))
-
-    def _observe_skill(
-        self,
-        memory: Memory,
-        i: int,
-        rows: Array,
-        mine: Array,
-        elapsed: Array,
-        step: Step,
-        end: Array,
-    ) -> None:
-        """Let skill ``i`` notice a step in ``rows[mine]``; where its call ends, set ``end``."""
-        skill, at = self.skills[i], rows[mine]
-        part = self._seen_by(memory, i, rows, mine, elapsed, step)
-        if skill.policy.watches:
-            skill.policy.observe(memory[str(i)], at, part)
-            if skill.policy.restricts:
-                end[mine[skill.policy.stuck(memory[str(i)], at, part.next_obs)]] = LIMIT
-        if skill.termination is not None:
-            end[mine[self.ask(skill.termination, part, at, skill.path, "termination")]] = OWN
-
-    def _seen_by(
-        self, memory: Memory, i: int, rows: Array, mine: Array, elapsed: Array, step: Step
-    ) -> Step:
-        """Return a step as skill ``i`` sees it in ``rows[mine]``."""
-        goal = self.goal_of(memory, i, rows[mine])
-        return part_of(step, elapsed[mine], mine, self.skills[i].max_steps, goal)
+        if not any(who.ends_matter for who in self._ready.values()):
+            return
+        succeeded = end == OWN  # where the skill does not say it itself
+        ended = np.flatnonzero(end != RUNNING)
+        for i, mine in _by_skill(running[ended]):
+            skill, over = self.skills[i], ended[mine]
+            if skill.success is not None:
+                part = seen(i, over)
+                succeeded[over] = self.ask(skill.success, part, rows[over], skill.path, "success")
+        for name, who in self._ready.items():
+            who.watch(memory[name], rows, step, LastCall(running, end, succeeded))
 
     def _interrupt(
         self, how: Interruption, memory: Memory, rows: Array, step: Step, end: Array
@@ -581,22 +574,6 @@ class Hierarchy(Choices, Policy):
         # Where no skill could be called, a new decision is worth nothing.
         again = np.where(self.startable(obs), worth[:, n], -np.inf)
         end[mine[again - worth[np.arange(len(rows)), running] > how.margin]] = INTERRUPTED
-
-    def _succeeded(
-        self, memory: Memory, rows: Array, step: Step, running: Array, elapsed: Array, end: Array
-    ) -> Array:
-        """(k,) bool: the calls that are over have succeeded.
-
-        By the skill's ``success``; of a skill without one, if its own termination ended the call.
-        """
-        found: Array = np.array(end == OWN)
-        ended = np.flatnonzero(end != RUNNING)
-        for i, mine in _by_skill(running[ended]):
-            skill, over = self.skills[i], ended[mine]
-            if skill.success is not None:
-                part = self._seen_by(memory, i, rows, over, elapsed, step)
-                found[over] = self.ask(skill.success, part, rows[over], skill.path, "success")
-        return found
 
     def check(self, sees: Space, acts: Space, goal: Space | None, where: str) -> None:
         """Check that the selector, the guide, the critic and all skills fit."""
