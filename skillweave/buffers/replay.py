@@ -14,20 +14,8 @@ from torch import Tensor
 from skillweave.algorithms.batches import Batch, Sample
 from skillweave.buffers.priorities import Priorities
 from skillweave.buffers.replay_storage import NOTHING, TERMINATED, Columns, copy_into
-from skillweave.errors import TrainingError
 from skillweave.spaces import ActionCodec, to_tensor
 from skillweave.types import Array
-
-
-class Relabel(Protocol):
-    """A judge that gives rows another outcome when they are drawn."""
-
-    raw: tuple[str, ...]
-    """The raw columns of ``SCHEMA`` that the judge needs."""
-
-    def __call__(self, rows: Batch) -> Batch:
-        """Return rows (P·B, n) with other ``reward``, ``terminated`` and ``truncated``."""
-        ...
 
 
 class _Settings(Protocol):
@@ -53,7 +41,6 @@ def replay_store(
     shared: bool = False,
     between: bool = False,
     raw: Sequence[str] = (),
-    relabel: Relabel | None = None,
     device: str | torch.device = "cpu",
 ) -> ReplayStore:
     """Return an empty replay store for an algorithm's settings.
@@ -64,7 +51,6 @@ def replay_store(
         num_envs: of all members together.
         shared: each member learns from the experience of all; ``buffer_size`` is then their total.
         between, raw: see ``OffPolicyAlgorithm``.
-        relabel: judges transitions again when they are drawn.
 
     Raises:
         TrainingError: the store is larger than the machine's memory.
@@ -84,7 +70,6 @@ def replay_store(
         alpha=config.priority_alpha,
         between=between,
         raw=raw,
-        relabel=relabel,
         device=device,
     )
 
@@ -102,8 +87,6 @@ class ReplayStore:
         n_step, prioritized, alpha: settings of sampling (Schaul et al. 2016).
         between: samples hold the observations between the n steps, too.
         raw: raw columns that are stored; a sample has those that are among its fields.
-        relabel: judges transitions again when they are drawn; None: they keep the reward and the
-            ends that they were stored with. Only for rows of one step.
         device: of the samples.
 
     Raises:
@@ -127,11 +110,8 @@ class ReplayStore:
         alpha: float = 0.6,
         between: bool = False,
         raw: Sequence[str] = (),
-        relabel: Relabel | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        needed = (*raw, *(() if relabel is None else relabel.raw))
-        self._relabel = relabel
         self._columns = Columns(
             capacity,
             num_envs,
@@ -141,7 +121,7 @@ class ReplayStore:
             mask_size=mask_size,
             each=4 * prioritized * (members if shared else 1),
             keep_rewards=shared,
-            raw=tuple(dict.fromkeys(needed)),
+            raw=tuple(raw),
         )
         self.num_envs = num_envs
         self._n_step = n_step
@@ -213,27 +193,18 @@ class ReplayStore:
         factor = gamma.float().cpu().numpy()[:, None]
         start = index % columns.slots
         slots, follows = self._chain(start)
-        outcome = None if self._relabel is None else self._judge_again(self._relabel, slots)
-        slot = start
-        goes_on = follows[0]
-        reward = columns.reward(factor, start) if outcome is None else outcome["reward"][..., 0]
-        discount = columns.power(factor, start)
-        terminated: Any = None if outcome is None else outcome["terminated"][..., 0]
+        slot, goes_on = start, follows[0]
+        reward, discount = columns.reward(factor, start), columns.power(factor, start)
         between: list[tuple[Array, Array]] = []
         for k in range(1, self._n_step):
             goes_on = goes_on & follows[k]
-            if outcome is not None:
-                goes_on &= ~outcome.ended[..., k - 1]
             slot = np.where(goes_on, slots[k], slot)
             between.append((slot, np.where(goes_on, discount, np.float32(0))))
-            paid = columns.reward(factor, slot) if outcome is None else outcome["reward"][..., k]
-            reward = reward + np.where(goes_on, discount * paid, np.float32(0))
+            paid = discount * columns.reward(factor, slot)
+            reward = reward + np.where(goes_on, paid, np.float32(0))
             discount = np.where(goes_on, discount * columns.power(factor, slot), discount)
-            if outcome is not None:
-                terminated = np.where(goes_on, outcome["terminated"][..., k], terminated)
         after = columns.after(slot)
-        if terminated is None:
-            terminated = data["kind"].take(slot) == TERMINATED
+        terminated = data["kind"].take(slot) == TERMINATED
         action = data["action"].take(start, axis=0)
         env_reward = data.get("env_reward")
         return Sample(
@@ -263,24 +234,6 @@ class ReplayStore:
             follows.append(self._columns.data["kind"].take(after) != NOTHING)
             slots.append(np.where(follows[-1], after, slots[-1]))
         return slots, follows
-
-    def _judge_again(self, relabel: Relabel, slots: Sequence[Array]) -> Batch:
-        """Return the outcome that ``relabel`` gives the n rows of ``slots`` (P, B), (P, B, n)."""
-        columns, data = self._columns, self._columns.data
-        if "steps" in data:
-            raise TrainingError("transitions of several steps cannot be judged again")
-        lead = (*slots[0].shape, len(slots))
-        flat = np.stack(slots, -1).reshape(-1, len(slots))
-        stored = {k: data[k].take(flat, axis=0) for k in ("obs", "action", "reward", *columns.raw)}
-        never = np.zeros(flat.shape, bool)
-        rows = Batch(
-            **stored,
-            next_obs=data["obs"].take(columns.after(flat), axis=0),
-            terminated=never,
-            truncated=never,
-        )
-        judged = relabel(rows)
-        return Batch(**{k: judged[k].reshape(lead) for k in ("reward", "terminated", "truncated")})
 
     def update_priorities(self, index: Array, priority: Tensor, first: int = 0) -> None:
         """Set the priorities (P, B), above 0, of the samples of members from ``first`` on."""

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import closing
 from functools import cached_property
 
 import numpy as np
 
-from skillweave._internal.seeding import Seeds, global_generators
-from skillweave.algorithms.batches import INFO, Batch
-from skillweave.envs.infos import random_actions, reported_success
-from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import DeclarationError
+from skillweave.envs.infos import reported_success
 from skillweave.policies.core import own_step, part_of
-from skillweave.policies.parts import GOAL, OBSERVATION
-from skillweave.skills import Skill, asked, path_of
-from skillweave.skills.goals import goals_of
-from skillweave.skills.info_words import StoredInfo
-from skillweave.skills.reads import info_keys_read
+from skillweave.skills import Skill, asked
 from skillweave.types import Array, Step
 
 
@@ -72,81 +62,6 @@ class Outcome:
 def judge(skill: Skill | None, step: Step, ids: Array | None = None) -> Outcome:
     """Judge n steps by a skill; the arguments are those of ``Outcome``."""
     return Outcome(skill, step, ids)
-
-
-def judged_by(skill: Skill, spec: EnvSpec) -> JudgedBy:
-    """Return a ``Relabel`` that judges by a skill, with the keys of ``info`` that it reads.
-
-    Raises:
-        DeclarationError: its reward changes, or it cannot be found out which keys it reads.
-    """
-    if skill.reward_changes:
-        raise DeclarationError(
-            f"skill {path_of(skill)!r}: its reward changes for the same step (reward_changes), so "
-            "steps cannot be judged by it again: let its reward depend on the step alone"
-        )
-    if skill.sees is not None:
-        raise DeclarationError(
-            f"skill {path_of(skill)!r}: its rows hold only the part of observations that it sees "
-            "(sees), so they cannot be judged again: leave out sees"
-        )
-    step = sample_step(spec)
-    if (goals := goals_of(skill)) is not None:
-        step = seen_by(skill, step, step.elapsed, goal=goals.start(1))
-    return JudgedBy(skill, info_keys_read(skill, step))
-
-
-@global_generators(Seeds(0) / "sample")
-def sample_step(spec: EnvSpec) -> Step:
-    """Return the first step of one environment, by a random action."""
-    with closing(make_engine(spec, 1)) as engine:
-        obs = engine.reset(0)
-        rng = np.random.default_rng(0)
-        action = random_actions(engine.action_space, 1, rng, engine.mask())
-        return engine.step(action).seen(obs, action, np.ones(1, np.int64))
-
-
-RAW = ("env_action", "env_reward", "env_terminated", "env_truncated", "call_elapsed")
-"""The raw columns that rows are judged by again."""
-
-
-class JudgedBy:
-    """Judges stored rows by a skill: a ``Relabel`` of replay.
-
-    Args:
-        skill: whose reward and ends count; it must answer the same when asked twice.
-        info: keys of ``info`` that its methods read, as ``info_keys_read`` finds them.
-    """
-
-    def __init__(self, skill: Skill, info: Sequence[str] = ()) -> None:
-        self._skill = skill
-        self._info = tuple(info)
-        self.raw = (*RAW, *(INFO + key for key in info))
-
-    def __call__(self, rows: Batch) -> Batch:
-        """Return the rows, any lead axes, with the skill's reward and ends."""
-        lead = rows["reward"].shape
-        flat = {k: v.reshape(-1, *v.shape[len(lead) :]) for k, v in rows.items()}
-        obs, next_obs, goal = flat["obs"], flat["next_obs"], None
-        if self._skill.goal_space is not None:  # stored as its networks see them
-            goal, obs, next_obs = obs[GOAL], obs[OBSERVATION], next_obs[OBSERVATION]
-        step = Step(
-            obs=obs,
-            action=flat["env_action"],
-            next_obs=next_obs,
-            reward=flat["env_reward"],
-            terminated=flat["env_terminated"],
-            truncated=flat["env_truncated"],
-            timed_out=np.zeros(len(flat["reward"]), bool),
-            elapsed=flat["call_elapsed"],
-            info=StoredInfo({key: flat[INFO + key] for key in self._info}),
-        )
-        outcome = judge(self._skill, seen_by(self._skill, step, step.elapsed, goal=goal))
-        return rows.replace(
-            reward=outcome.reward.reshape(lead),
-            terminated=outcome.terminated.reshape(lead),
-            truncated=outcome.truncated.reshape(lead),
-        )
 
 
 def seen_by(

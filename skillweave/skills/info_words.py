@@ -18,17 +18,8 @@ def info_keys(info: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(key for key in texts if not (key.startswith("_") and key[1:] in info))
 
 
-class StoredInfo(dict[str, Any]):
-    """The part of an info that was recorded with stored steps."""
-
-
 def missing_key(info: Mapping[str, Any]) -> str:
-    """Return a clause on a key that no environment sets, or that was not recorded."""
-    if isinstance(info, StoredInfo):
-        return (
-            f"this key of info was not recorded with the steps (recorded: {keys_of(info)}): name "
-            "all that the skill's methods read in its class, needs_info = ('key', ...)"
-        )
+    """Return a clause on a key that no environment sets."""
     return (
         f"no environment set this key of info in this step (the keys are: {keys_of(info)}): let "
         "the environment set it in each step"

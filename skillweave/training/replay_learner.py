@@ -13,7 +13,7 @@ from torch import Tensor
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.batches import Batch
-from skillweave.buffers.replay import Relabel, ReplayStore, replay_store
+from skillweave.buffers.replay import ReplayStore, replay_store
 from skillweave.experience.acting import ActionRepeat, Request
 from skillweave.ops.device import resolve_device
 from skillweave.spaces import to_tensor
@@ -256,14 +256,12 @@ def store_of(
     members: int = 1,
     *,
     shared: bool = False,
-    relabel: Relabel | None = None,
 ) -> ReplayStore:
     """Return an empty replay store for an algorithm's samples.
 
     Args:
         num_envs: of all members together.
         shared: each member learns from the experience of all.
-        relabel: judges transitions again when they are drawn.
 
     Raises:
         TrainingError: the store is larger than the machine's memory.
@@ -278,7 +276,6 @@ def store_of(
         shared=shared,
         between=algorithm.between,
         raw=algorithm.raw,
-        relabel=relabel,
         device=resolve_device(algorithm.config.device),
     )
 

@@ -11,13 +11,11 @@ import torch
 from worlds import ON, SMALL, SPACES, GoTo, Point, Rest, declared, far_corner, go_to
 
 import skillweave as sw
-from skillweave.algorithms.batches import Batch
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
 from skillweave.evolution import Evolution
-from skillweave.experience.judge import JudgedBy
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills.goal_spaces import draw_from, shown_goal, with_goal
-from skillweave.skills.goals import Goals, goals_of
+from skillweave.skills.goals import goals_of
 from skillweave.spaces import obs_dtype
 
 
@@ -410,25 +408,6 @@ def test_goals_are_drawn_and_joined(name):
         draw_from(skill.goal_space, 9, np.random.default_rng(3)),
     )
     goals.fitted(obs[:2], goals.start(2), "test")
-
-
-def test_rows_are_judged_again_with_their_goals():
-    skill, rng = go_to(), np.random.default_rng(0)
-    obs, after, goal = (rng.uniform(-1, 1, (5, 2)).astype(np.float32) for _ in range(3))
-    goals = Goals(skill)
-    no = np.zeros((5, 1), bool)
-    rows = Batch(
-        obs=goals.join(obs, goal)[:, None],
-        next_obs=goals.join(after, goal)[:, None],
-        reward=np.zeros((5, 1), np.float32),
-        env_action=obs[:, None],
-        env_reward=np.zeros((5, 1), np.float32),
-        env_terminated=no,
-        env_truncated=no,
-        call_elapsed=np.ones((5, 1), np.int64),
-    )
-    judged = JudgedBy(skill)(rows)
-    assert np.allclose(judged["reward"][:, 0], -np.abs(after - goal % 2).sum(1))
 
 
 def test_captions_show_the_goal():

@@ -410,10 +410,3 @@ def test_calls_are_logged(tmp_path):
     other = crane(selector=in_turn).train(quiet=True)
     with pytest.raises(RunError, match="has changed since the log was recorded"):
         log.check_skills(other.policy.skills)
-
-
-def test_rows_of_a_part_cannot_be_judged_again():
-    from skillweave.experience.judge import judged_by
-
-    with pytest.raises(DeclarationError, match=r"skill 'arm'.*leave out sees"):
-        judged_by(Arm(), on())
