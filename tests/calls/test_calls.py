@@ -10,18 +10,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls.reference import Call, Choices, Moment, calls, episode
+from calls.reference import Call, Choices as Chosen, Moment, calls, episode
 from calls.users import GAMMA, SEED, USERS, Got, Played, User, plain
 from calls.worlds import ACTIONS, GOALS, RESTS, SEES, SELECTORS, World, WorldLevel, world
-from reference_calls import T, scripted, seeds_of
+from reference_calls import T, Walk, scripted, seeds_of
+from toy_acting import Choices, requests
+from toys import calling_in
 
 from skillweave._internal.seeding import Seeds
+from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.experience.calls import SMOOTHED
+from skillweave.hierarchy.options import OptionsEnv
 from skillweave.policies.core import CallEnd
-from skillweave.policies.hierarchy import unless_none
 from skillweave.skills import Skill
-from skillweave.skills.lengths import Lengths
-from skillweave.skills.skill_set import SkillSet, hierarchy_of
+from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Array
 
 
@@ -87,9 +89,9 @@ def near(got: Any, want: Any) -> bool:
     return bool((np.abs(np.subtract(got, want, dtype=np.float64)) < 1e-5).all())
 
 
-def choices_of(level: WorldLevel, steps: list[Got]) -> Choices:
+def choices_of(level: WorldLevel, steps: list[Got]) -> Chosen:
     """What a user has chosen that chooses by itself."""
-    found: Choices = []
+    found: Chosen = []
     for memory in (s.acted for s in steps if s.acted["elapsed"] == 0):
         skill, number, goal = level.skills[memory["skill"]], memory["skill"], None
         if level.lengths:
@@ -212,8 +214,15 @@ class AtFirst(Skill):
 
 
 def test_where_no_skill_may_start_all_choices_are_open_to_the_value_of_what_follows() -> None:
-    skills = AtFirst(), AtFirst()
-    policy = hierarchy_of(SkillSet(skills, (scripted(0), scripted(2)), call_steps=Lengths(1, 2)))
-    obs = np.zeros((2, 4), np.float32)
-    obs[1, T] = 1
-    assert unless_none(policy.may_start(obs)).all()
+    skills = SkillSet((AtFirst(), AtFirst()), (scripted(0), scripted(2)), call_steps=20)
+    engines = (make_engine(EnvSpec(Walk, engine="sync"), 20) for _ in range(2))
+    env = OptionsEnv(next(engines), skills, GAMMA)
+    env.reset(seed=0)
+    *_, truncated, info = env.step(np.zeros(20, int))
+    assert truncated.any()
+    assert info["next_action_mask"].all()
+    collector = calling_in(next(engines), Choices(20, 2), skills)
+    collector.start(Seeds(SEED))
+    batch = collector.collect(next(requests(20))).batches[""]
+    assert batch["truncated"][batch.valid_rows].any()
+    assert batch["next_mask"][batch.valid_rows].all()
