@@ -17,10 +17,9 @@ from skillweave.errors import EnvError, SkillweaveError
 from skillweave.experience.judge import judge, seen_by
 from skillweave.policies.core import OWN, RUNNING
 from skillweave.skills import Skill
-from skillweave.skills.goals import Goals
-from skillweave.skills.info_words import missing_key
+from skillweave.skills.goals import Goals, check_reads_goal, is_unchecked
+from skillweave.skills.outputs import missing_key
 from skillweave.skills.own_part import OwnPart
-from skillweave.skills.reads import check_reads_goal, is_unchecked
 from skillweave.types import Array, Step
 
 AT_ONCE = 1 << 26

@@ -13,7 +13,7 @@ from skillweave import tree
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.policies.core import CallEnd
 from skillweave.skills import LastCall
-from skillweave.skills.ready_selector import TreeSelector, ready_selector
+from skillweave.skills.selector import TreeSelector, ready_selector
 
 ABC = ("a", "b", "c")
 
