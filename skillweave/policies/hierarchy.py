@@ -56,9 +56,6 @@ TRIES = 16
 """The most goals that are chosen for a call, where those before hold already."""
 
 
-ADVICE = "; give one in it, or let the skill move goals into it: clip_goal(obs, goal)"
-
-
 @dataclass(eq=False)
 class CallGoals:
     """The goals of a skill's calls."""
@@ -102,12 +99,23 @@ class CallGoals:
         """
         if not (inside := self.space.holds(goals)).all():
             says = self.space.is_out(goals[~inside][0], who, f"skill {self.name!r}")
-            raise SkillError(says + ADVICE * (self.clip is None))
+            advice = "; give one in it, or let the skill move goals into it: clip_goal(obs, goal)"
+            raise SkillError(says + advice * (self.clip is None))
         return goals
 
     def hold(self, obs: Array, goal: Array) -> Array:
-        """Return the goals (n, …) that hold in ``obs`` (n, …) already, (n,) bool."""
-        return goals_hold(self.termination, obs, goal)
+        """Return the goals (n, …) for which a call would end at once, (n,) bool.
+
+        For them ``termination`` is true for a step that stands still in ``obs`` (n, …). Where it
+        fails for such a step, as it reads ``info`` for example, no goal holds.
+        """
+        zeros, ones = np.zeros(len(obs), np.float32), np.ones(len(obs), np.int64)
+        no = zeros > 0
+        still = Step(obs, zeros, obs, zeros, no, no, no, ones, {}, goal)
+        ends: Any = self.termination
+        with suppress(Exception), np.errstate(all="ignore"):
+            return np.array(ends(still), bool).reshape(len(obs))
+        return no
 
     def contains(self, goal: Array) -> bool:
         """Return whether all goals (n, *goal_shape) are in the space."""
@@ -135,20 +143,6 @@ class CalledSkill:
     success: Callable[..., Any] | None = code("a Step to (n,) bool", "success", needed=False)
     goals: Any = field(default=None, metadata={"kind": CallGoals | None})
     """``CallGoals``, or what else has their methods; None: it has none."""
-
-
-def goals_hold(termination: Any, obs: Array, goal: Array) -> Array:
-    """Return the goals (n, …) for which a call would end at once, (n,) bool.
-
-    For them ``termination`` is true for a step that stands still in ``obs`` (n, …). Where it
-    fails for such a step, as it reads ``info`` for example, no goal holds.
-    """
-    zeros, ones = np.zeros(len(obs), np.float32), np.ones(len(obs), np.int64)
-    no = zeros > 0
-    still = Step(obs, zeros, obs, zeros, no, no, no, ones, {}, goal)
-    with suppress(Exception), np.errstate(all="ignore"):
-        return np.array(termination(still), bool).reshape(len(obs))
-    return no
 
 
 @dataclass(eq=False)
