@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -121,7 +121,6 @@ def train(
     seeds: Seeds,
     budget: int,
     *,
-    counts: Literal["steps", "updates"] = "steps",
     resume_from: Progress | None = None,
     schedule_steps: int | None = None,
     skip_diverged: bool = False,
@@ -135,8 +134,7 @@ def train(
     Args:
         collectors: fresh or already started.
         episodes: the latest episodes, for the metrics; new ones are added.
-        budget: environment steps, or updates.
-        counts: unit of the budget; a source that makes no steps needs updates.
+        budget: environment steps.
         schedule_steps: the part of the budget at which schedules end; None: all of it.
         skip_diverged: continue where a member diverges.
         checkpoint_every: environment steps between checkpoints. They are also written by time
@@ -153,7 +151,7 @@ def train(
         KeyboardInterrupt: after an interrupt, when a checkpoint is written.
     """
     loop = _Loop(learner, collectors, episodes, seeds, resume_from or Progress(), on_tick)
-    loop.schedule_steps, loop.counts = schedule_steps or budget, counts
+    loop.schedule_steps = schedule_steps or budget
     loop.skip_diverged = skip_diverged
     loop.checkpoint_every = checkpoint_every
     loop.on_checkpoint, loop.on_calls = on_checkpoint, on_calls
@@ -161,7 +159,7 @@ def train(
         try:
             collectors.start(seeds / "start")
             loop.request()
-            while loop.spent < budget:
+            while loop.at.steps < budget:
                 loop.round(budget)
             loop.report()
         finally:
@@ -173,7 +171,6 @@ class _Loop:
     """One stage's training."""
 
     schedule_steps: int
-    counts: Literal["steps", "updates"]
     skip_diverged: bool
     checkpoint_every: int
     on_checkpoint: OnCheckpoint | None
@@ -207,10 +204,10 @@ class _Loop:
         if self.on_calls is not None and collected.calls is not None:
             self.on_calls(collected.calls)
         self.report()
-        before, steps, update = self.spent, at.steps, at.update
+        before, update = at.steps, at.update
         at.steps += collected.steps
         at.update += 1
-        over = self.spent >= budget
+        over = at.steps >= budget
         self.episodes.extend(collected.episodes, collected.info_keys, collected.longest)
         if len(collected.begun_anew):
             learner.cut(collected.begun_anew)
@@ -218,13 +215,13 @@ class _Loop:
         if learner.overlap and not over:
             self.request()  # before the parameters change
         every = learner.report_every
-        self._start_update(update, not every or over or crossed(every, before, self.spent))
+        self._start_update(update, not every or over or crossed(every, before, at.steps))
         if not learner.overlap:
             self.report()
             if not over:
                 self.request()
         if not over:
-            self._save_if_due(steps)
+            self._save_if_due(before)
 
     def request(self) -> None:
         """Prepare the next request with the present parameters."""
@@ -270,13 +267,8 @@ class _Loop:
         """Stop after a pending update, as it changes states in place."""
         self._thread.close()
 
-    @property
-    def spent(self) -> int:
-        """The part of the budget that is spent."""
-        return self.at.update if self.counts == "updates" else self.at.steps
-
     def _progress(self) -> float:
-        return min(1.0, self.spent / self.schedule_steps)
+        return min(1.0, self.at.steps / self.schedule_steps)
 
     def _take_time(self) -> None:
         self.at.seconds = time.perf_counter() - self._started

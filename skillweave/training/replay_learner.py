@@ -76,10 +76,6 @@ class ReplayLearner:
         """Skip the phase of random actions: the policy is trained already."""
         self._acts_at_random = False
 
-    def learn_from_the_start(self) -> None:
-        """Learn from the first rows on, as these are recorded, and need not be explored for."""
-        self._acts_at_random, self._learns_from = False, -1
-
     def request(self, update: int, steps: int, progress: float) -> Request:
         """Return a request for ``train_freq`` rows of every environment."""
         explored = progress if self._acts_at_random else 1.0  # ε of DQN does not start again
