@@ -21,7 +21,7 @@ from safetensors.torch import load_file
 import skillweave as sw
 from skillweave import recipes
 from skillweave.errors import KINDS, SkillweaveError
-from skillweave.skills.ready_selector import FunctionSelector
+from skillweave.skills.selector import FunctionSelector
 
 SMALL = sw.PPO(num_envs=4, n_steps=32, batch_size=32)
 FAST: dict[str, Any] = {"steps": 256, "learn": "apart", "algorithm": SMALL, "selector": SMALL}

@@ -13,7 +13,7 @@ from skillweave.errors import EnvError
 from skillweave.policies.core import OWN_REWARD, SUCCESS
 from skillweave.policies.infos import NUMBERS, batched_infos
 from skillweave.policies.spaces import allows_each
-from skillweave.skills.info_words import info_keys
+from skillweave.skills.outputs import info_keys
 from skillweave.spaces import (
     action_codec,
     choice_counts,

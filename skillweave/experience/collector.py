@@ -32,7 +32,7 @@ from skillweave.policies.core import (
 )
 from skillweave.policies.spaces import Space, space_of
 from skillweave.skills.goals import goals_of
-from skillweave.skills.info_words import info_keys
+from skillweave.skills.outputs import info_keys
 from skillweave.types import Array, Step, prefixed, unprefixed
 
 RETURN, TASK_RETURN, LENGTH, SUCCESS = range(4)

@@ -17,10 +17,9 @@ from skillweave.algorithms.batches import OF_STEP, Batch, Trace
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.policies.core import OWN, RUNNING, own_step, part_of
 from skillweave.skills import Skill, asked
-from skillweave.skills.goals import Goals
-from skillweave.skills.info_words import missing_key
+from skillweave.skills.goals import Goals, check_reads_goal, is_unchecked
+from skillweave.skills.outputs import missing_key
 from skillweave.skills.own_part import OwnPart
-from skillweave.skills.reads import check_reads_goal, is_unchecked
 from skillweave.types import Array, Step
 
 AT_ONCE = 1 << 26

@@ -12,7 +12,7 @@ from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, settings
 from skillweave.skills import Reflex
 from skillweave.skills.lengths import Lengths
 from skillweave.skills.own_part import ZERO
-from skillweave.skills.ready_selector import ReadyValue
+from skillweave.skills.selector import ReadyValue
 from skillweave.training.stage import Together
 
 StartCalls = (

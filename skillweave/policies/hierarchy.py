@@ -56,9 +56,6 @@ TRIES = 16
 """The most goals that are chosen for a call, where those before hold already."""
 
 
-ADVICE = "; give one in it, or let the skill move goals into it: clip_goal(obs, goal)"
-
-
 @dataclass(eq=False)
 class CallGoals:
     """The goals of a skill's calls."""
@@ -102,12 +99,23 @@ class CallGoals:
         """
         if not (inside := self.space.holds(goals)).all():
             says = self.space.is_out(goals[~inside][0], who, f"skill {self.name!r}")
-            raise SkillError(says + ADVICE * (self.clip is None))
+            advice = "; give one in it, or let the skill move goals into it: clip_goal(obs, goal)"
+            raise SkillError(says + advice * (self.clip is None))
         return goals
 
     def hold(self, obs: Array, goal: Array) -> Array:
-        """Return the goals (n, …) that hold in ``obs`` (n, …) already, (n,) bool."""
-        return goals_hold(self.termination, obs, goal)
+        """Return the goals (n, …) for which a call would end at once, (n,) bool.
+
+        For them ``termination`` is true for a step that stands still in ``obs`` (n, …). Where it
+        fails for such a step, as it reads ``info`` for example, no goal holds.
+        """
+        zeros, ones = np.zeros(len(obs), np.float32), np.ones(len(obs), np.int64)
+        no = zeros > 0
+        still = Step(obs, zeros, obs, zeros, no, no, no, ones, {}, goal)
+        ends: Any = self.termination
+        with suppress(Exception), np.errstate(all="ignore"):
+            return np.array(ends(still), bool).reshape(len(obs))
+        return no
 
     def contains(self, goal: Array) -> bool:
         """Return whether all goals (n, *goal_shape) are in the space."""
@@ -135,20 +143,6 @@ class CalledSkill:
     success: Callable[..., Any] | None = code("a Step to (n,) bool", "success", needed=False)
     goals: Any = field(default=None, metadata={"kind": CallGoals | None})
     """``CallGoals``, or what else has their methods; None: it has none."""
-
-
-def goals_hold(termination: Any, obs: Array, goal: Array) -> Array:
-    """Return the goals (n, …) for which a call would end at once, (n,) bool.
-
-    For them ``termination`` is true for a step that stands still in ``obs`` (n, …). Where it
-    fails for such a step, as it reads ``info`` for example, no goal holds.
-    """
-    zeros, ones = np.zeros(len(obs), np.float32), np.ones(len(obs), np.int64)
-    no = zeros > 0
-    still = Step(obs, zeros, obs, zeros, no, no, no, ones, {}, goal)
-    with suppress(Exception), np.errstate(all="ignore"):
-        return np.array(termination(still), bool).reshape(len(obs))
-    return no
 
 
 @dataclass(eq=False)
@@ -521,44 +515,37 @@ class Hierarchy(Choices, Policy):
             end[elapsed >= memory["length"][rows]] = LIMIT
         end[elapsed >= self._limits[running]] = LIMIT
         own = own_step(step)
+
+        def seen(i: int, mine: Array) -> Step:
+            """Return the step as skill ``i`` sees it in ``rows[mine]``."""
+            goal = self.goal_of(memory, i, rows[mine])
+            return part_of(own, elapsed[mine], mine, self.skills[i].max_steps, goal)
+
         for i, mine in _by_skill(running):
-            if i in self._asked:
-                self._observe_skill(memory, i, rows, mine, elapsed, own, end)
+            if i not in self._asked:
+                continue
+            skill, at, part = self.skills[i], rows[mine], seen(i, mine)
+            if skill.policy.watches:
+                skill.policy.observe(memory[str(i)], at, part)
+                if skill.policy.restricts:
+                    end[mine[skill.policy.stuck(memory[str(i)], at, part.next_obs)]] = LIMIT
+            if skill.termination is not None:
+                end[mine[self.ask(skill.termination, part, at, skill.path, "termination")]] = OWN
         if self.interruption is not None:
             self._interrupt(self.interruption, memory, rows, step, end)
         end_with_episode(end, step.terminated | step.truncated)
         memory["end"][rows] = end
-        if any(who.ends_matter for who in self._ready.values()):
-            succeeded = self._succeeded(memory, rows, own, running, elapsed, end)
-            for name, who in self._ready.items():
-                who.watch(memory[name], rows, step, LastCall(running, end, succeeded))
-
-    def _observe_skill(
-        self,
-        memory: Memory,
-        i: int,
-        rows: Array,
-        mine: Array,
-        elapsed: Array,
-        step: Step,
-        end: Array,
-    ) -> None:
-        """Let skill ``i`` notice a step in ``rows[mine]``; where its call ends, set ``end``."""
-        skill, at = self.skills[i], rows[mine]
-        part = self._seen_by(memory, i, rows, mine, elapsed, step)
-        if skill.policy.watches:
-            skill.policy.observe(memory[str(i)], at, part)
-            if skill.policy.restricts:
-                end[mine[skill.policy.stuck(memory[str(i)], at, part.next_obs)]] = LIMIT
-        if skill.termination is not None:
-            end[mine[self.ask(skill.termination, part, at, skill.path, "termination")]] = OWN
-
-    def _seen_by(
-        self, memory: Memory, i: int, rows: Array, mine: Array, elapsed: Array, step: Step
-    ) -> Step:
-        """Return a step as skill ``i`` sees it in ``rows[mine]``."""
-        goal = self.goal_of(memory, i, rows[mine])
-        return part_of(step, elapsed[mine], mine, self.skills[i].max_steps, goal)
+        if not any(who.ends_matter for who in self._ready.values()):
+            return
+        succeeded = end == OWN  # where the skill does not say it itself
+        ended = np.flatnonzero(end != RUNNING)
+        for i, mine in _by_skill(running[ended]):
+            skill, over = self.skills[i], ended[mine]
+            if skill.success is not None:
+                part = seen(i, over)
+                succeeded[over] = self.ask(skill.success, part, rows[over], skill.path, "success")
+        for name, who in self._ready.items():
+            who.watch(memory[name], rows, step, LastCall(running, end, succeeded))
 
     def _interrupt(
         self, how: Interruption, memory: Memory, rows: Array, step: Step, end: Array
@@ -581,22 +568,6 @@ class Hierarchy(Choices, Policy):
         # Where no skill could be called, a new decision is worth nothing.
         again = np.where(self.startable(obs), worth[:, n], -np.inf)
         end[mine[again - worth[np.arange(len(rows)), running] > how.margin]] = INTERRUPTED
-
-    def _succeeded(
-        self, memory: Memory, rows: Array, step: Step, running: Array, elapsed: Array, end: Array
-    ) -> Array:
-        """(k,) bool: the calls that are over have succeeded.
-
-        By the skill's ``success``; of a skill without one, if its own termination ended the call.
-        """
-        found: Array = np.array(end == OWN)
-        ended = np.flatnonzero(end != RUNNING)
-        for i, mine in _by_skill(running[ended]):
-            skill, over = self.skills[i], ended[mine]
-            if skill.success is not None:
-                part = self._seen_by(memory, i, rows, over, elapsed, step)
-                found[over] = self.ask(skill.success, part, rows[over], skill.path, "success")
-        return found
 
     def check(self, sees: Space, acts: Space, goal: Space | None, where: str) -> None:
         """Check that the selector, the guide, the critic and all skills fit."""

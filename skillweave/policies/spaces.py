@@ -274,7 +274,6 @@ class Space:
         n: int,
         who: str,
         skill: str,
-        kind: type[SkillweaveError] = SkillError,
         rows: Array | None = None,
     ) -> Array:
         """Return goals as an array of the space's type, (n, *shape); no number changes.
@@ -285,7 +284,6 @@ class Space:
             values: (n, *shape); of a Dict or Tuple also dicts and tuples of such arrays.
             who: whose goals they are, for messages.
             skill: which is given them, for messages.
-            kind: the type of the error.
             rows: the environments (k,) whose goals are returned, (k, *shape); None: all. The goals
                 of the others may be anything.
 
@@ -295,19 +293,19 @@ class Space:
         known = getattr(values, "dtype", None), getattr(values, "shape", None)
         if known == (self.record, (n, *self.shape)):
             return np.asarray(values if rows is None else values[rows])
-        given = self._given(values, n, who, kind, skill)
+        given = self._given(values, n, who, SkillError, skill)
         if self.parts is not None:
             packed = np.zeros(n if rows is None else len(rows), self.record)
             for name, part in self.parts.items():
                 whose = f"the part {name!r} of {skill}"
-                packed[name] = part.goals(given[name], n, who, whose, kind, rows)
+                packed[name] = part.goals(given[name], n, who, whose, rows)
             return packed
         goals: Array = given if rows is None else given[rows]
         with np.errstate(over="ignore"):  # an infinity is out of every space
             numbers = goals.astype(self.record)
         if self.record.kind != "f" and (changed := numbers != goals).any():
             row = np.argwhere(changed)[0, 0]
-            raise kind(self.is_out(goals[row], who, skill) + "; give one in it")
+            raise SkillError(self.is_out(goals[row], who, skill) + "; give one in it")
         return numbers
 
     def _given(

@@ -9,11 +9,10 @@ from skillweave.skills.automaton import Automaton
 from skillweave.skills.base import Reflex, Skill, asked, is_trained, path_of
 from skillweave.skills.onnx_file import from_onnx
 from skillweave.skills.ready import ready_policy
-from skillweave.skills.ready_selector import ready_selector
 from skillweave.skills.residual import Residual
 from skillweave.skills.sb3 import from_sb3
 from skillweave.skills.scripted import from_function
-from skillweave.skills.selector import ReadySelector
+from skillweave.skills.selector import ReadySelector, ready_selector
 from skillweave.skills.torch_module import from_torch
 
 __all__ = [

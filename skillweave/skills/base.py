@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -113,10 +113,8 @@ class Skill:
             ``Residual`` of such a policy, and one with ``learn=True``. Where an
             environment has an action mask, networks that return logits respect it; actions of
             others go to the environment unchanged.
-        needs_info: keys of ``info`` that its methods read; None: found by calling them once. Needed
-            only where steps are recorded to be judged later, and a key is read in some steps alone.
         reward_changes: True if ``reward`` is meant to change for the same step, as a bonus for what
-            was seldom seen does. It may then keep a state, and steps are never judged by it again.
+            was seldom seen does. It may then keep a state.
         color: RGB in captions and plots; None: chosen from a palette.
     """
 
@@ -132,7 +130,6 @@ class Skill:
     sees: Any = None
     acts: Any = None
     policy: Any = None
-    needs_info: Sequence[str] | None = None
     reward_changes: bool = False
     color: Color | None = None
 
@@ -230,7 +227,7 @@ class Skill:
         kinds = annotations_of(Skill)
         for field in ("color", "goal_space"):
             fitted(kinds[field], getattr(self, field), f"{where}: {field}")
-        for field in ("max_steps", "call_steps", "needs_info", "reward_changes", *_OF_TRAINING):
+        for field in ("max_steps", "call_steps", "reward_changes", *_OF_TRAINING):
             value = getattr(self, field)
             converted = fitted(kinds[field], value, f"{where}: {field}")
             if converted is not value and (is_trained(self) or field not in _OF_TRAINING):

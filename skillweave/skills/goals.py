@@ -1,4 +1,4 @@
-"""Goals of skills: drawn, checked, and joined with observations.
+"""Goals of skills: drawn, checked, joined with observations, and whether a skill reads them.
 
 A skill with a goal is one policy for many tasks: its networks see the observation and the goal
 (universal value functions, Schaul et al. 2015). What they see is an element of
@@ -7,20 +7,23 @@ A skill with a goal is one policy for many tasks: its networks see the observati
 
 from __future__ import annotations
 
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from skillweave._internal.messages import short
-from skillweave.errors import DeclarationError, EnvError, SkillError
+from skillweave._internal.notices import notice
+from skillweave.errors import DeclarationError, EnvError, SkillError, SkillweaveError
 from skillweave.policies.hierarchy import TRIES, CallGoals
 from skillweave.policies.parts import joined
 from skillweave.policies.spaces import space_of
 from skillweave.skills.base import Skill, path_of
 from skillweave.skills.goal_spaces import alone
 from skillweave.skills.outputs import called
-from skillweave.types import Array, read_only
+from skillweave.skills.probing import first_time, untouched
+from skillweave.types import Array, Step, read_only
 
 
 def goals_of(skill: Skill | None) -> Goals | None:
@@ -109,3 +112,51 @@ class Goals(CallGoals):
             )
         goals = space.goals(batch, 1, who, self._who).copy()
         return goals if self.clip is not None else self.inside(goals, who)
+
+
+class _Watched(Step):
+    """A step that notes whether its goal is read."""
+
+    reads = False
+
+    @property
+    def goal(self) -> Any:
+        """Return the goal, and note that it was read."""
+        self.reads = True
+        return self._goal
+
+    @goal.setter
+    def goal(self, value: Any) -> None:
+        self._goal = value
+
+
+def is_unchecked(skill: Skill) -> bool:
+    """Return True once for each skill."""
+    return first_time(skill, "its goal")
+
+
+def check_reads_goal(skill: Skill, step: Step) -> None:
+    """Give a notice where neither reward, termination nor success of a skill reads its goal.
+
+    It would learn to ignore its goal.
+
+    Args:
+        step: some steps of the skill, with goals.
+    """
+    if skill.reward_changes:
+        return
+    watched = _Watched(**{field.name: getattr(step, field.name) for field in fields(Step)})
+    watched.reads = False
+    try:
+        for method in filter(skill.defines, ("reward", "termination", "success")):
+            who = f"skill {path_of(skill)!r}: {method}()"
+            with untouched(skill):  # it leaves no traces
+                called(getattr(skill, method), watched, who, judges=None)
+    except SkillweaveError:
+        return  # it is raised where the step is judged
+    if not watched.reads:
+        notice(
+            f"skill {path_of(skill)!r} has goals, but its reward(), termination() and success() "
+            "are the same for every goal: none reads step.goal, so the skill learns to ignore its "
+            "goal. Let its reward depend on step.goal, or leave out goal_space"
+        )

@@ -84,6 +84,7 @@ _Steps = Annotated[int, Check(f"at least 1 and at most {LONGEST:,}", lambda x: 1
 class Scaling:
     """A scaling of inputs: ``(number - offset) * scale``, then clipped."""
 
+    _from_dict = True
     _: KW_ONLY
     scale: Numbers = 1.0
     """A factor, or one for each number."""
@@ -188,6 +189,7 @@ class Acts:
         DeclarationError: a setting is wrong; the message names it.
     """
 
+    _from_dict = True
     to: Places | None = None
     """The places of the outputs in the environment's action, in its flat form: a slice, or a list
     of places, one for each output. Of Discrete actions: the number, from 0, of each choice of the
@@ -286,7 +288,7 @@ class PolicyMapping:
         """Return the mapping that ``to_json`` wrote.
 
         Args:
-            data: its JSON; further fields are ignored.
+            data: its JSON.
             code: the user's functions, by name.
 
         Raises:
@@ -297,17 +299,12 @@ class PolicyMapping:
         sees = fitted(dict[str, tuple[Any, ...]] | None, data.get("sees"), "sees")
         for name, parts in (sees or {}).items():
             where = f"sees[{name!r}]"
-            each = (_from_json(None, x, code, f"{where}[{i}]") for i, x in enumerate(parts))
-            sees[name] = tuple(each)
-        goal, acts = data.get("goal"), data.get("acts")
+            sees[name] = tuple(_source(x, code, f"{where}[{i}]") for i, x in enumerate(parts))
+        goal = data.get("goal")
         if isinstance(goal, Mapping):
             goal = _function(goal.get("function"), code, "goal")
-        if acts is not None:
-            acts = _from_json(Acts, acts, code, "acts")
-        scaling = {
-            k: _from_json(Scaling, v, code, f"scaling[{k!r}]")
-            for k, v in fitted(dict[str, Any], data.get("scaling", {}), "scaling").items()
-        }
+        acts = fitted(Acts | None, data.get("acts"), "acts")
+        scaling = fitted(dict[str, Scaling], data.get("scaling", {}), "scaling")
         state = fitted(tuple[tuple[Any, ...], ...], data.get("state", ()), "state")
         single = data.get("single_state", False)
         every, chunk = data.get("every", 1), data.get("chunk")
@@ -504,28 +501,23 @@ def to_json(value: Any, names: Mapping[int, str] | None = None) -> Any:
     return content
 
 
-def _from_json(kind: type[Any] | None, data: Any, code: Mapping[str, Any], where: str) -> Any:
-    """Return the settings that an object has; further fields are ignored.
+def _source(data: Any, code: Mapping[str, Any], where: str) -> Source:
+    """Return a source, of the one of ``KINDS`` that its field ``source`` names.
 
     Args:
-        kind: None: the one of ``KINDS`` that its field ``source`` names.
         code: the user's functions, by name.
     """
+    name = data.get("source") if isinstance(data, Mapping) else None
+    kind = KINDS.get(name) if isinstance(name, str) else None
     if kind is None:
-        name = data.get("source") if isinstance(data, Mapping) else None
-        kind = KINDS.get(name) if isinstance(name, str) else None
-        if kind is None:
-            raise DeclarationError(
-                f"{where} is {short(data)}; its field source must be one of {', '.join(KINDS)}"
-            )
-    fitted(Mapping[str, Any], data, where)
-    given = {entry.name: data[entry.name] for entry in fields(kind) if entry.name in data}
+        raise DeclarationError(
+            f"{where} is {short(data)}; its field source must be one of {', '.join(KINDS)}"
+        )
+    given = {k: x for k, x in data.items() if k != "source"}
     if kind is Computed:
-        given["function"] = _function(data.get("function"), code, where)
-    try:
-        return kind(**given)
-    except DeclarationError as error:
-        raise DeclarationError(f"{where}: {error}") from None
+        given["function"] = _function(given.get("function"), code, where)
+    source: Source = fitted(kind, given, where)
+    return source
 
 
 def _function(name: Any, code: Mapping[str, Any], where: str) -> Callable[[Any], Any]:

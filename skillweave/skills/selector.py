@@ -1,10 +1,11 @@
-"""The base of ready selectors, which choose skills without training."""
+"""Ready selectors, which choose skills without training: their base, functions and trees."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
-from functools import partial
+import json
+from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property, partial
 from typing import Any, Self
 
 import numpy as np
@@ -14,14 +15,26 @@ from gymnasium.spaces import Dict
 from skillweave._internal.messages import shortened
 from skillweave._internal.terminal import one_line
 from skillweave.errors import DeclarationError
+from skillweave.policies import selectors
 from skillweave.policies.core import LastCall
+from skillweave.policies.files import checksum
 from skillweave.policies.functional import Functional
 from skillweave.policies.parts import GOAL
-from skillweave.policies.selectors import Rule, function_name
+from skillweave.policies.selectors import (
+    Asked,
+    Branch,
+    Check,
+    Leaf,
+    Rule,
+    function_name,
+    skill_and_goal,
+)
 from skillweave.policies.spaces import space_of
-from skillweave.skills.foreign_policy import Foreign
+from skillweave.skills.foreign_policy import Foreign, made_up, qualified
 from skillweave.skills.goal_spaces import alone
-from skillweave.skills.outputs import Wrapped, answer, called
+from skillweave.skills.outputs import Wrapped, answer, called, required_arguments
+from skillweave.skills.probing import probe
+from skillweave.skills.tree import Composite, Condition, Node, Sequence
 from skillweave.types import Array, Memory, Memoryless, Step
 
 
@@ -147,3 +160,129 @@ def goal_as_json(goal: Any) -> Any:
 def listed(names: tuple[str, ...]) -> str:
     """Join names to a part of a sentence."""
     return shortened(one_line(", ".join(names)), 300)
+
+
+# Functions and trees ---------------------------------------------------------------------------
+
+ReadyValue = Callable[..., Any] | ReadySelector | Composite
+"""A function of observations, an automaton or another ready selector, or a behaviour tree."""
+
+
+def ready_selector(value: Any, skills: tuple[str, ...]) -> ReadySelector | None:
+    """Convert ``value`` to a selector among skills of these names; None: it is not one.
+
+    Raises:
+        DeclarationError: it names another skill.
+    """
+    selector: ReadySelector
+    if isinstance(value, ReadySelector):
+        selector = value
+    elif isinstance(value, Composite):
+        selector = TreeSelector(value)
+    elif callable(value) and not isinstance(value, type):
+        selector = FunctionSelector(value)
+    else:
+        return None
+    return selector.among(skills)
+
+
+class FunctionSelector(ReadySelector):
+    """A function from observations (n, *obs_shape) to skills (n,): names, or places in the list.
+
+    If it needs a second argument, that is the ``LastCall``. Where skills have goals, it returns
+    skills and goals: ``(names, goals)``, the goals (n, *goal_shape), or a dict of such goals by
+    skill where several have some. They count where the skill is chosen.
+
+    Raises:
+        SkillError: when it acts: the function failed, or chose an unknown skill, or a skill that
+            may not start.
+    """
+
+    kind = "function"
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(f"function {function_name(function)}()")
+        self.function = function
+
+    @cached_property
+    def in_place(self) -> Asked:  # type: ignore[override]
+        """The rule that acts."""
+        asks_last = required_arguments(self.function) > 1
+        return Asked(*self._rule_of, Wrapped(self.function, self._ask), asks_last)
+
+    def _ask(self, obs: Array, *last: LastCall) -> Any:
+        value = called(self.function, obs, self._who, more=last)
+        if self.in_place.parted(value, len(obs))[1] is None:
+            probe(self.function, (obs, *last), self._who)
+        return value
+
+    def source(self) -> dict[str, Any]:
+        """Return the function's name."""
+        return {"kind": self.kind, "name": qualified(self.function)}
+
+
+class TreeSelector(ReadySelector):
+    """A behaviour tree as a policy over skills; see ``policies.selectors.Tree``.
+
+    Raises:
+        DeclarationError: the tree has no skill.
+        SkillError: when it acts: the tree ends without a skill.
+    """
+
+    kind = "tree"
+
+    def __init__(self, root: Composite) -> None:
+        super().__init__("tree")
+        self.root = root
+        if not list(self.named()):
+            raise DeclarationError(
+                "the tree has no skill: give at least one skill's name as a child"
+            )
+
+    def named(self) -> Iterator[tuple[str, str, Any]]:
+        """Yield the skills of all leaves, with their goals."""
+        nodes: list[Node] = [self.root]
+        while nodes:
+            node = nodes.pop(0)
+            if isinstance(node, Composite):
+                nodes[:0] = node.children
+            elif not isinstance(node, Condition):
+                yield "a leaf", *skill_and_goal(node)
+
+    @cached_property
+    def in_place(self) -> selectors.Tree:  # type: ignore[override]
+        """The rule that acts."""
+        return selectors.Tree(*self._rule_of, self._node(self.root))
+
+    def _node(self, node: Node) -> selectors.Node:
+        if isinstance(node, Condition):
+            return Check(node.name, checked_function(node.function, self._who, node.name))
+        if isinstance(node, Composite):
+            children = tuple(map(self._node, node.children))
+            return Branch(
+                "Sequence" if isinstance(node, Sequence) else "Fallback", children, node.memory
+            )
+        name, goal = skill_and_goal(node)
+        return Leaf(name, None if goal is None else self._goal(name, goal, self._who))
+
+    def try_out(self) -> None:
+        """Evaluate every condition once on two example observations."""
+        obs = made_up(self.observation_space, 2)
+        for condition in self.in_place.checks:
+            condition.function(obs)
+
+    def source(self) -> dict[str, Any]:
+        """Return the checksum of its nodes, with only the names of functions."""
+        whole = json.dumps(_as_json(self.root))
+        return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
+
+
+def _as_json(node: Node) -> Any:
+    """Return a node as JSON."""
+    if isinstance(node, str):
+        return node
+    if isinstance(node, tuple):
+        return [node[0], goal_as_json(node[1])]
+    if isinstance(node, Condition):
+        return {"condition": node.name}
+    return {type(node).__name__: [_as_json(c) for c in node.children], "memory": node.memory}

@@ -235,13 +235,9 @@ def policy_of(
     inside = Joined(inside) if joins and goals is not None else inside
     if part is None or part.correction is None:
         return inside
-    return Corrects(inside, base_of(part, goals), part.correction)
-
-
-def base_of(part: OwnPart, goals: Goals | None) -> Policy:
-    """Return the policy that a skill corrects; a hierarchy remembers its own last actions."""
     who = f"{part.who}: the act() of the policy that it corrects"
-    return policy_of(part.base, goals, None, who, outermost=True)
+    # A hierarchy that is corrected remembers its own last actions.
+    return Corrects(inside, policy_of(part.base, goals, None, who, outermost=True), part.correction)
 
 
 ENDS = ("initiation", "termination", "success")

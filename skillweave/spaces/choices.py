@@ -48,18 +48,9 @@ class ChoiceSpace(gym.spaces.Dict):
         self.goal_spaces = dict(goal_spaces)
         self.owners = dict(owners)
 
-    @property
-    def row_size(self) -> int:
-        """Return the numbers of a choice in ``rows``."""
-        return int(self.rows(np.zeros(1, obs_dtype(self))).shape[1])
-
     def rows(self, choice: Array) -> Array:
-        """Return choices (n,) as rows (n, row_size) float64: the number, then all goals."""
+        """Return choices (n,) as rows (n, …) float64: the number, then all goals."""
         return space_of(self).flat(choice)
-
-    def of_rows(self, rows: Array) -> Array:
-        """Return the choices (n,) of rows (n, row_size)."""
-        return space_of(self).of_numbers(rows)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""All that let skills act: each plays a case and returns what happened, for the comparison."""
+"""All that let skills act: each plays a world and returns what happened, for the comparison."""
 
 from __future__ import annotations
 
@@ -12,34 +12,35 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
+import gymnasium as gym
 import numpy as np
 import pytest
-from calls.cases import Case, LevelCase, Worth, guide_of, policy_of, ready, selector_of, skill_set
+from calls.worlds import Chooser, Network, World, Worths, leaves, made
 from reference_calls import seeds_of
 from toys import alone_in, calling_in
 
+import skillweave as sw
 from skillweave._internal.seeding import Seeds
-from skillweave.api.player import Player as Deployed
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.experience.acting import Acted, Request
 from skillweave.experience.collector import Collector
-from skillweave.experience.levels import UntrainedHierarchy
 from skillweave.export import compile
+from skillweave.export.graphs import examples, mask_width
 from skillweave.export.runner import Runner
-from skillweave.export.write import write_export
+from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.options import OptionsEnv
-from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.policies import leaves
-from skillweave.policies.core import Memory, Policy, Turn, World, flat, restart, take
-from skillweave.policies.hierarchy import ActiveGuide
+from skillweave.policies import leaves as policy_leaves
+from skillweave.policies.core import Memory, Turn, World as Acting, flat, restart, take
 from skillweave.policies.spaces import space_of
 from skillweave.skills import Skill
-from skillweave.skills.skill_set import acting_policy
+from skillweave.spaces import ChoiceSpace, pack
 from skillweave.training.play import SeededEpisodes, play
 from skillweave.types import Array, Step
 
 N, SEED = 3, 5
 GAMMA = 0.5  # so that sums are exact
+SEEDS = range(21, 26)
+"""Of episodes; users share them, so that the reference need not play as many."""
 
 
 # What happened ----------------------------------------------------------------------------------
@@ -68,12 +69,8 @@ class Played:
     """Of each environment the decisions, as rows of experience; None: it gives none."""
     finished: list[tuple[float, float]] | None = None
     """Return and length of the episodes that are over; None: this user does not report them."""
-    missing: str = "never"
-    """A pattern of the names in memories that it does not have."""
     restarts: bool = True
     """What it remembers after an episode's last step is that of the next episode."""
-    chooses: bool = True
-    """The case's selector chooses; else the user does, and the reference follows it."""
 
 
 def plain(x: Any) -> Any:
@@ -136,32 +133,19 @@ class Watch:
         engine.step = watched
 
 
-def engine_of(case: Case, n: int = N) -> Any:
-    return make_engine(EnvSpec(case.env, engine="sync"), n)
+def engine_of(world: World) -> Any:
+    return make_engine(EnvSpec(world.env, engine="sync"), N)
 
 
-# Policies ---------------------------------------------------------------------------------------
-
-
-def policies_of(level: LevelCase) -> tuple[Any, ...]:
-    return tuple(
-        hierarchy(s.policy) if isinstance(s.policy, LevelCase) else policy_of(s.policy)
-        for s in level.skills
-    )
-
-
-def hierarchy(level: LevelCase) -> HierarchyPolicy:
-    return HierarchyPolicy(
-        selector_of(level), skill_set(level, policies_of(level)), guide_of(level)
-    )
+# Collectors -------------------------------------------------------------------------------------
 
 
 class Learner:
-    """A ``Net`` where ``Acting`` stands: acts as it would under the case's settings."""
+    """A stand-in where ``Acting`` stands: acts as it would under the world's settings."""
 
     members = 1
 
-    def __init__(self, net: Any, greedy: bool = True) -> None:
+    def __init__(self, net: Any, greedy: bool) -> None:
         self.net, self.memory_size, self.greedy = net, net.size, greedy
         self.each, self.stacks = N, ((net, 1),)
 
@@ -169,156 +153,102 @@ class Learner:
         pass
 
     def to_env(self, action: Array) -> Array:
-        return action
+        space = self.net.action_space
+        return space_of(space).of_numbers(action) if isinstance(space, ChoiceSpace) else action
 
     def widened(self, mask: Array | None) -> Array | None:
         return mask
 
     def some(self, rows: Array, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
+        if isinstance(self.net, Worths):  # of a critic
+            return Acted(np.zeros(len(obs), np.int64), self.net.heads(obs), None)
         before = {} if memory is None else {"rnn": memory}
         action, after = self.net.act(before, obs, mask, deterministic=self.greedy)
-        return Acted(action, action[:, None].astype(np.float32), after.get("rnn"))
+        if isinstance(space := self.net.action_space, ChoiceSpace):
+            action = space.rows(action).astype(np.float32)
+        first = np.zeros(len(obs)) if action.dtype.names else action.reshape(len(obs), -1)[:, 0]
+        return Acted(action, first[:, None].astype(np.float32), after.get("rnn"))
 
 
-class Critic(Learner):
-    """A ``Worth`` where ``Acting`` stands."""
-
-    memory_size = 0
-
-    def __init__(self, skills: int) -> None:
-        self.worth, self.each = Worth(skills), N
-
-    def some(self, rows: Array, obs: Array, mask: Any, memory: Any) -> Acted:
-        return Acted(np.zeros(len(obs), np.int64), self.worth.heads(obs), None)
-
-
-# Collectors -------------------------------------------------------------------------------------
-
-
-def decisions(case: Case) -> Played:
+def decisions(world: World) -> Played:
     """A selector that learns, above skills that can act."""
-    guide, selector = _first(case)
-    skills = skill_set(case.level, policies_of(case.level))
-    return collected(
-        case, lambda: calling_in(engine_of(case), selector, skills, True, guide), "", {}
-    )  # fmt: skip
+    return trained(world, together=False)
 
 
-def joint(case: Case) -> Played:
+def joint(world: World) -> Played:
     """A selector and all skills that can learn; hierarchies below are trained, too."""
-    learners: dict[str, Any] = {}
-    margins: dict[str, float] = {}
+    return trained(world, together=True)
 
-    def skills_of(level: LevelCase, path: str) -> Any:
-        policies: list[Any] = []
-        for i, skill in enumerate(level.skills):
-            name = f"{path}s{i}"
-            if isinstance(skill.policy, LevelCase):
-                below = skill.policy
-                greedy = level.greedy and below.greedy_selector
-                if not below.ready:
-                    learners[f"{name}/selector"] = Learner(selector_of(below), greedy)
-                chooser = selector_of(below) if below.ready else None
-                inner = skills_of(below, f"{name}/")
-                policies.append(UntrainedHierarchy(inner, chooser, guide_of(below)))
-            elif skill.policy in ("net", "counts"):
-                learners[name] = Learner(policy_of(skill.policy), level.greedy)
-                policies.append(None)
-            else:
-                policies.append(policy_of(skill.policy))
-        if level.margin is not None:
-            learners[f"{path}skill_critic"] = Critic(len(level.skills))
-            margins[f"{path}skill_critic"] = level.margin
-        return skill_set(level, tuple(policies))
 
-    guide, selector = _first(case)
-    skills = skills_of(case.level, "")
+def trained(world: World, together: bool) -> Played:
+    built, learners = made(world), dict[str, Any]()
+    for path, stand in built.policies.items():
+        if isinstance(stand, Network | Worths):
+            learners[path] = Learner(stand, built.greedy(path))
+    first = learners.pop("selector", None)
+    how: dict[str, Any] = {"keep_rewards": not together, "guide": built.guide()}
+    skills = built.learning() if together else built.hierarchy().skills
+    if together:
+        how |= {"learners": learners, "margins": built.margins()}
 
     def make() -> Collector:
-        how = {"guide": guide, "learners": learners, "margins": margins}
-        return calling_in(engine_of(case), selector, skills, **how)
+        return calling_in(engine_of(world), first, skills, **how)
 
-    return collected(case, make, "selector", learners)
+    watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
+    columns: list[list[dict[str, Any]]] = [[] for _ in range(N)]
+    finished: list[tuple[float, float]] = []
+    for found in _rounds(world, watch, make, memory_of, learners if together else {}):
+        finished += map(tuple, found.episodes[:, [0, 2]].tolist())
+        if (batch := found.batches.get("selector" if together else "")) is None:
+            continue
+        names = batch.keys() - {"valid", "recurrent_state"}
+        for t, n in zip(*np.nonzero(batch.valid_rows), strict=True):
+            row = {k: batch[k][t, n] for k in names}
+            if t == 0 and "recurrent_state" in batch:
+                row["recurrent_state"] = batch["recurrent_state"][n]
+            columns[n].append(row)
+    return Played(watch.episodes, None if world.level.ready else columns, finished)
 
 
-def _first(case: Case) -> tuple[ActiveGuide | None, Learner | None]:
-    """The first guide and selector of a collector; a ready selector is a guide that decides."""
-    level = case.level
-    if level.ready:
-        return ActiveGuide(ready(level, level.selector), decides=True), None
-    greedy = case.deterministic and level.greedy_selector
-    return guide_of(level), Learner(selector_of(level), greedy)
+def memory_of(collector: Any) -> Memory:
+    overridden = getattr(collector, "overridden", None)
+    return collector.memory | ({} if overridden is None else {"overridden": overridden})
 
 
 def _rounds(
-    case: Any, watch: Watch, make: Callable[[], Any], memory_of: Callable[[Any], Memory],
+    world: World, watch: Watch, make: Callable[[], Any], memory_of: Callable[[Any], Memory],
     learners: dict[str, Any],
 ) -> Iterator[Any]:  # fmt: skip
     """What a collector returns, request by request; perhaps another one goes on half way."""
-    collector, count = make(), case.steps // case.rows
+    collector, count = make(), world.steps // world.rows
     collector.start(Seeds(SEED))
     for i in range(count):
-        if case.resumed and i == count // 2:
+        if world.resumed and i == count // 2:
             state, collector = collector.state(), make()
             assert not len(collector.restore(state)), "an environment did not repeat itself"
-        if i == 0 or (case.resumed and i == count // 2):
+        if i == 0 or (world.resumed and i == count // 2):
             watch.on(collector.engine, partial(memory_of, collector))
         request = Request(
-            case.rows, (), np.array([GAMMA]), Seeds(0) / i, greedy=case.deterministic
+            world.rows, (), np.array([GAMMA]), Seeds(0) / i, greedy=world.deterministic
         )  # fmt: skip
         found = collector.collect(replace(request, below=dict.fromkeys(learners, request)))
-        assert found.steps == case.rows * N, "an environment waited"
+        assert found.steps == world.rows * N, "an environment waited"
         watch.observed(np.arange(N), memory_of(collector))
         yield found
 
 
-def collected(
-    case: Any, make: Callable[[], Any], path: str | None, learners: dict[str, Any]
-) -> Played:  # fmt: skip
-    """What a collector does that ``make`` returns.
-
-    Args:
-        path: of its first selector, whose decisions are kept; None: nobody's are.
-    """
-
-    def memory_of(collector: Any) -> Memory:
-        overridden = getattr(collector, "overridden", None)
-        more = {} if overridden is None else {"overridden": overridden}
-        return collector.memory | more
-
-    watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
-    columns: list[list[dict[str, Any]]] | None = [[] for _ in range(N)]
-    finished: list[tuple[float, float]] = []
-    for found in _rounds(case, watch, make, memory_of, learners):
-        batches = found.batches
-        finished += map(tuple, found.episodes[:, [0, 2]].tolist())
-        if path in batches and columns is not None:
-            batch = batches[path]
-            names = batch.keys() - {"valid", "recurrent_state"}
-            for t, n in zip(*np.nonzero(batch.valid_rows), strict=True):
-                row = {k: batch[k][t, n] for k in names}
-                if t == 0 and "recurrent_state" in batch:
-                    row["recurrent_state"] = batch["recurrent_state"][n]
-                columns[n].append(row)
-    ready = case.level.ready
-    if ready or path is None:
-        columns = None
-    return Played(watch.episodes, columns, finished)
-
-
-def leads_to_starts(case: Case) -> Played:
+def leads_to_starts(world: World) -> Played:
     """The skills as those that lead to where another one may start; they sample."""
-    sampled = replace(case.level, greedy=False)
     never = type("Never", (Skill,), {"initiation": lambda self, obs: np.zeros(len(obs), bool)})
-    skills = skill_set(case.level, policies_of(sampled))
+    skills = made(world).hierarchy().skills
     watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
 
     def make() -> Collector:
-        return alone_in(engine_of(case), Anything(), never(), skills=skills)
+        return alone_in(engine_of(world), Anything(), never(), skills=skills)
 
-    for _ in _rounds(case, watch, make, lambda collector: collector.search.memory, {}):
+    for _ in _rounds(world, watch, make, lambda collector: collector.search.memory, {}):
         pass
-    return Played(watch.episodes, missing=r"^selector\.", chooses=False)
+    return Played(watch.episodes)
 
 
 class Anything:
@@ -330,27 +260,21 @@ class Anything:
         pass
 
 
-# The player alone -------------------------------------------------------------------------------
+# Those that act ---------------------------------------------------------------------------------
 
 
-def alone(case: Case) -> Played:
-    level = case.level
-    skills = skill_set(level, policies_of(level))
-    return in_a_loop(case, acting_policy(skills, selector_of(level), guide_of(level)))
-
-
-def in_a_loop(case: Any, policy: Policy) -> Played:
-    """The player in a plain loop."""
-    engine = engine_of(case)
+def alone(world: World) -> Played:
+    """The policy in a plain loop."""
+    engine, policy = engine_of(world), made(world).hierarchy().in_place
     watch, rows = Watch(seeds_of(SEED, N)), np.arange(N)
     memory, age = policy.start(N), np.zeros(N, np.int64)
     overridden = np.zeros(N, bool)
     watch.on(engine, lambda: memory | {"overridden": overridden})
     obs = engine.reset(SEED)
-    for _ in range(case.steps):
+    for _ in range(world.steps):
         overridden[:] = False
-        world = World(age=age, overridden=overridden)
-        turn = Turn(world, engine.mask(), greedy=case.deterministic)
+        acting = Acting(age=age, overridden=overridden)
+        turn = Turn(acting, engine.mask(), greedy=world.deterministic)
         action = policy.act(memory, rows, obs, turn)
         raw = engine.step(action)
         age += 1
@@ -367,41 +291,34 @@ def in_a_loop(case: Any, policy: Policy) -> Played:
     return Played(watch.episodes, restarts=False)
 
 
-# Policies in evaluation and deployment -----------------------------------------------------------
+def evaluated(world: World) -> Played:
+    return in_evaluation(world, made(world).hierarchy(), [*SEEDS])
 
 
-def evaluated(case: Case) -> Played:
-    return in_evaluation(case, hierarchy(case.level), [11, 12, 13, 14, 15, 16, 17])
-
-
-def in_evaluation(case: Any, policy: Any, seeds: list[int]) -> Played:
+def in_evaluation(world: World, policy: Any, seeds: list[int]) -> Played:
     """Whole episodes, in environments of which fewer and fewer act in the end."""
     watch = Watch([iter([seed]) for seed in seeds])  # each episode counts as an environment
-    episodes = SeededEpisodes(engine_of(case), seeds, 1_000)
+    episodes = SeededEpisodes(engine_of(world), seeds, 1_000)
     chosen: list[Memory] = []
 
     def keep(memory: Memory) -> None:
         chosen.append(take(memory, episodes.rows))
 
-    how: Any = {"deterministic": case.deterministic, "before_step": keep}
+    how: Any = {"deterministic": world.deterministic, "before_step": keep}
     for played in play(policy, episodes, **how):
         watch.step(played.episode, played.step.action, played.step, chosen[-1], True)
         watch.observed(played.episode, take(played.memory, played.rows), True)
     return Played(watch.episodes, restarts=False)
 
 
-def deployed(case: Case) -> Played:
-    """One observation at a time."""
-    player = Deployed(hierarchy(case.level), deterministic=case.deterministic)
-    return one_by_one(case, player, lambda: player.memory)
+def deployed(world: World) -> Played:
+    player = sw.Player(made(world).hierarchy(), deterministic=world.deterministic)
+    return one_by_one(world, player, SEEDS[:3])
 
 
-def one_by_one(
-    case: Any, acts: Any, memory: Callable[[], Memory], seeds: Iterable[int] = range(21, 25)
-) -> Played:  # fmt: skip
+def one_by_one(world: World, acts: Any, seeds: Iterable[int]) -> Played:
     """One observation at a time; ``acts``: of them."""
-    found = Played()
-    env = case.env()
+    found, env = Played(), world.env()
     for seed in seeds:
         steps: list[Got] = []
         obs, info = env.reset(seed=seed)
@@ -409,7 +326,7 @@ def one_by_one(
         reward, over = 0.0, False
         while not over:
             action = acts.act(obs, reward=reward, info=info)
-            remembered = {k: np.atleast_1d(v)[0].tolist() for k, v in flat(memory()).items()}
+            remembered = {k: np.atleast_1d(v)[0].tolist() for k, v in flat(acts.memory).items()}
             obs, reward, terminated, truncated, info = env.step(action)
             steps.append(Got(plain(action), plain(obs), float(np.float32(reward)), remembered))
             over = terminated or truncated
@@ -420,17 +337,17 @@ def one_by_one(
 # OptionsEnv -------------------------------------------------------------------------------------
 
 
-def options_env(case: Case) -> Played:
-    """The case's selector chooses the actions of an ordinary vector of environments."""
-    skills = skill_set(case.level, policies_of(case.level))
-    env = OptionsEnv(engine_of(case), skills, GAMMA)
+def options_env(world: World) -> Played:
+    """The world's selector chooses the actions of an ordinary vector of environments."""
+    built = made(world)
+    env = OptionsEnv(engine_of(world), built.hierarchy().skills, GAMMA)
     watch = Watch(seeds_of(SEED, N))
     watch.on(env.engine, lambda: env._memory)
     obs, info = env.reset(seed=SEED)
-    selector = selector_of(case.level)
-    greedy, memory = case.deterministic and case.level.greedy_selector, selector.start(N)
+    selector, greedy = built.policies["selector"], built.greedy("selector")
+    memory = selector.start(N)
     columns: list[list[dict[str, Any]]] = [[] for _ in range(N)]
-    for _ in range(case.steps // 3):
+    for _ in range(world.steps // 3):
         mask = info.get("action_mask")
         choice, memory = selector.act(memory, obs, mask, deterministic=greedy)
         rows = {"obs": obs, "action": choice}
@@ -447,94 +364,141 @@ def options_env(case: Case) -> Played:
         for k, v in selector.start(N).items():
             memory[k][over] = v[over]
         for n in range(N):
-            columns[n].append({k: v[n] for k, v in rows.items()})
-    return Played(watch.episodes, columns, missing=r"^selector\.")
+            columns[n].append({k: row_of(v, n) for k, v in rows.items()})
+    return Played(watch.episodes, columns)
 
 
-# The exported runner ----------------------------------------------------------------------------
+def row_of(x: Any, n: int) -> Any:
+    """A row of an array, or of a dict of arrays."""
+    return {k: row_of(v, n) for k, v in x.items()} if isinstance(x, dict) else x[n]
+
+
+# Exports ----------------------------------------------------------------------------------------
 
 
 class Session:
-    """Stands for an ONNX session; the file's content is the number of a policy."""
+    """Stands for an ONNX session; the file's content is the number of a network."""
 
     known: list[tuple[Any, bool]] = []  # noqa: RUF012
 
     def __init__(self, content: bytes, who: str) -> None:
-        self.policy, self.sampled = self.known[int(content)]
-
-    def get_inputs(self) -> list[Any]:
-        shapes = {"obs": ("float", self.policy.observation_space.shape[0])}
-        if not isinstance(self.policy, Worth):
-            shapes |= {"mask": ("bool", int(self.policy.action_space.n))}
-            shapes |= {"memory": ("float", self.policy.size)} if self.policy.size else {}
-        return [
-            SimpleNamespace(name=name, type=f"tensor({kind})", shape=[1, n])
-            for name, (kind, n) in shapes.items()
-        ]
-
-    def run(self, _: None, feeds: dict[str, Array]) -> list[Array]:
-        if isinstance(self.policy, Worth):
-            return [self.policy.heads(feeds["obs"])]
-        memory = {"rnn": feeds["memory"]} if "memory" in feeds else {}
-        action, after = self.policy.act(
-            memory, feeds["obs"], feeds["mask"], deterministic=not self.sampled
-        )  # fmt: skip
-        return [action, *after.values()]
+        self.net, self.sampled = self.known[int(content)]
 
     @classmethod
-    def graph(cls, policy: Any, sampled: Any, where: str = "") -> Any:
-        cls.known.append((policy, sampled is True))
-        file = b"%d" % (len(cls.known) - 1)
-        if isinstance(policy, Worth):
-            return file
-        sees, acts = space_of(policy.observation_space), space_of(policy.action_space)
-        return leaves.Network(file, sees, acts, int(policy.action_space.n), policy.size)
+    def graph(cls, net: Any, sampled: Any, where: str = "") -> Any:
+        cls.known.append((net, sampled is True))
+        content = b"%d" % (len(cls.known) - 1)
+        if isinstance(net, Worths):
+            return content
+        noise = (("gumbel", 1),) if sampled else ()
+        spaces = map(space_of, (net.observation_space, net.action_space))
+        width = mask_width(net.action_space)
+        return policy_leaves.Network(content, *spaces, width, net.size, noise)
+
+    def get_inputs(self) -> list[Any]:
+        kinds = {"f": "float", "i": "int64"}
+        net = self.net
+        found = [
+            SimpleNamespace(
+                name=name, type=f"tensor({kinds[leaf.numpy().dtype.kind]})", shape=leaf.shape
+            )
+            for name, leaf in examples(net.observation_space).items()
+        ]
+        sizes = {}
+        if isinstance(net, Network):
+            sizes = {"memory": net.size, "noise.0": int(self.sampled)}
+            if masked := mask_width(net.action_space):
+                found.append(SimpleNamespace(name="mask", type="tensor(bool)", shape=[1, masked]))
+        for name, size in sizes.items():
+            if size:
+                found.append(SimpleNamespace(name=name, type="tensor(float)", shape=[1, size]))
+        return found
+
+    def run(self, _: Any, feeds: dict[str, Array]) -> list[Array]:
+        given = {k: v for k, v in feeds.items() if k.startswith("obs")}
+        named = [pair for name, x in given.items() for pair in leaves(x, name)]
+        if isinstance(self.net, Worths):
+            return [self.net.named(named)]
+        memory = {"rnn": feeds["memory"]} if "memory" in feeds else {}
+        found, after = self.net.named(memory, named, feeds.get("mask"), not self.sampled)
+        if isinstance(self.net, Chooser):
+            number, goals = found
+            parts = [x for name in goals for _, x in leaves(goals[name], "")]
+            found = np.concatenate([number[:, None], *parts], axis=1) if goals else number
+        elif isinstance(space := self.net.action_space, gym.spaces.Dict):
+            found = space_of(space).flat(pack(space, found))
+        return [found, *after.values()]
 
 
 @contextmanager
-def stand_ins(session: Any) -> Iterator[None]:
-    """Let networks be written and opened by ``session``."""
-    with (
-        patch.object(compile, "agent_graph", session.graph),
-        patch.object(compile, "worth_graph", session.graph),
-        patch.object(leaves, "open_session", session),
-    ):
-        yield
-
-
-def exported(case: Case) -> Played:
-    """The runner; its networks are those of the case."""
+def folder_of(world: World) -> Iterator[tuple[str, Export]]:
+    """Its exported folder, whose networks are stand-ins."""
     pytest.importorskip("onnxruntime")
-    with tempfile.TemporaryDirectory() as folder, stand_ins(Session):
-        export = write_export(Path(folder), hierarchy(case.level), "walk")
-        runner = Runner(folder, export.functions)
-        return one_by_one(case, runner, lambda: runner.memory)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        patch.object(compile, "agent_graph", Session.graph),
+        patch.object(compile, "worth_graph", Session.graph),
+        patch.object(policy_leaves, "open_session", Session),
+    ):
+        yield folder, write_export(Path(folder), made(world).hierarchy(), "crane")
 
 
-def drawn_by_automata(level: LevelCase) -> bool:
-    """An automaton would draw its choices if the skills of this level sampled."""
-    return any(below.selector == "automaton" for below in level.below)
+def exported(world: World) -> Played:
+    with folder_of(world) as (folder, export):
+        return one_by_one(world, Runner(folder, export.functions), SEEDS)
 
 
-def can_be_exported(case: Case) -> bool:
-    """Its policies are networks and functions, and its guides restrict."""
-    levels = [*case.level.all]
-    paid = any(s.policy == "paid" for level in levels for s in level.skills)
-    restrict = all(level.guide is None or level.guide_restricts for level in levels)
-    return case.deterministic and restrict and not paid
+def read_again(world: World) -> Played:
+    with folder_of(world) as (folder, export):
+        policy = sw.load_policy(folder, code=export.functions)
+        return in_evaluation(world, policy, [*SEEDS[:2]])
 
 
-USERS: dict[str, tuple[Callable[[Case], Played], Callable[[Case], bool]]] = {
-    "player": (alone, lambda case: True),
-    "decisions": (decisions, lambda case: True),
-    "joint": (joint, lambda case: True),
-    "evaluation": (evaluated, lambda case: True),
-    "deployment": (deployed, lambda case: True),
-    "OptionsEnv": (options_env, lambda case: not case.level.ready and case.level.guide is None),
-    "start states": (
-        leads_to_starts,
-        lambda case: case.level.guide is None and not drawn_by_automata(case.level),
-    ),
-    "exported": (exported, can_be_exported),
+# All of them ------------------------------------------------------------------------------------
+
+
+def anything(world: World) -> bool:
+    return True
+
+
+def can_be_chosen_for(world: World) -> bool:
+    """Its first selector is trained, and nothing is beside it."""
+    return not world.level.ready and world.level.guide is None
+
+
+def can_search(world: World) -> bool:
+    """No automaton would draw its choices where the skills of the first level sample."""
+    return not any(below.selector == "automaton" for below in world.level.below)
+
+
+def can_be_exported(world: World) -> bool:
+    """It is greedy, and none of its policies remembers what it observes, which ONNX cannot."""
+    skills = [skill for level in world.level.all for skill in level.skills]
+    watching = any("watching" in (skill.policy, skill.corrects) for skill in skills)
+    return world.deterministic and not watching
+
+
+@dataclass(frozen=True)
+class User:
+    plays: Callable[[World], Played]
+    can_play: Callable[[World], bool] = anything
+    learns: str = "none"
+    """Which selectors learn; see ``Course``."""
+    missing: str = "never"
+    """A pattern of the names in memories that it does not have."""
+    chooses: bool = False
+    """It chooses by itself, among skills that sample."""
+
+
+USERS = {
+    "player": User(alone),
+    "decisions": User(decisions, learns="first"),
+    "joint": User(joint, learns="all"),
+    "evaluation": User(evaluated),
+    "deployment": User(deployed),
+    "OptionsEnv": User(options_env, can_be_chosen_for, "outside", r"^selector\."),
+    "start states": User(leads_to_starts, can_search, chooses=True),
+    "exported": User(exported, can_be_exported),
+    "read again": User(read_again, can_be_exported),
 }
-"""By name, what plays a case, and whether it can play this one."""
+"""By name, what plays a world."""

@@ -1,4 +1,4 @@
-"""Hierarchies drawn by seed, of all that skills can declare, in the world of a crane; plain data.
+"""Hierarchies drawn by seed, of all that can be declared, in the world of a crane; plain data.
 
 Networks are stand-ins: what they answer follows from the numbers that they are given, and from
 their names. Each number that reaches them, or a function of the user, thus counts to the last bit.
@@ -15,15 +15,15 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from calls.cases import Machine
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
 
 import skillweave as sw
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.hierarchy.assembly import assembled, learning_set
-from skillweave.hierarchy.fitting import ready_policies, ready_selectors
+from skillweave.hierarchy.fitting import active_guide, ready_policies, ready_selectors
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles, roles_of
+from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.skills.goal_spaces import blank_choices
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.spaces import obs_dtype
@@ -48,7 +48,7 @@ GOALS: dict[str, Any] = {
 
 
 class Crane(gym.Env):
-    """A crane that drifts; an episode lasts 5 to 14 steps, and is terminated or truncated."""
+    """A crane that drifts; after 5 to 14 steps an episode is terminated, truncated, or both."""
 
     observation_space = OBSERVATIONS
 
@@ -67,7 +67,7 @@ class Crane(gym.Env):
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
         self.t, self.length = 0, int(self.np_random.integers(5, 15))
-        self.breaks = bool(self.np_random.integers(2))
+        self.end = int(self.np_random.integers(3))
         self.place = self.np_random.uniform(-1, 1, 3).astype(np.float32)
         return self._answer()
 
@@ -83,7 +83,8 @@ class Crane(gym.Env):
         self.t += 1
         over = self.t == self.length
         obs, info = self._answer()
-        return obs, float(-np.abs(self.place).sum()), over and self.breaks, over, info
+        ends = over and self.end != 1, over and self.end != 0
+        return obs, float(-np.abs(self.place).sum()), *ends, info
 
 
 @functools.cache
@@ -184,6 +185,15 @@ def about(step: Step, whole: bool) -> list[tuple[str, Array]]:
 
 
 # Declarations -----------------------------------------------------------------------------------
+
+
+@dataclass
+class Machine:
+    """An automaton as plain data: skills of each state, best first; (from, to, event)."""
+
+    states: list[list[int]]
+    arrows: list[tuple[int, int, str]]
+    events: dict[str, Any]
 
 
 def half_hook(obs: Any) -> Any:
@@ -325,7 +335,11 @@ class WorldLevel:
     greedy: bool = True
     greedy_selector: bool = True
     margin: float | None = None
-    guide = None
+    guide: str | None = None
+    """A ready selector beside one that is trained: "last" or "automaton"."""
+    guide_restricts: bool = True
+    guide_tells: bool = False
+    """What it would choose is recorded where the selector learns."""
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -340,11 +354,15 @@ class WorldLevel:
         return self.selector not in SELECTORS[:2]
 
     @property
+    def below(self) -> Iterator[WorldLevel]:
+        """The levels of skills that are hierarchies."""
+        return (s.below for s in self.skills if s.below is not None)
+
+    @property
     def all(self) -> Iterator[WorldLevel]:
         yield self
-        for skill in self.skills:
-            if skill.below is not None:
-                yield from skill.below.all
+        for level in self.below:
+            yield from level.all
 
     @property
     def goals(self) -> dict[str, str]:
@@ -416,7 +434,8 @@ class World:
     masked: bool
     rows: int
     resumed: bool
-    deterministic = True
+    deterministic: bool
+    """The first selector is asked for greedy choices."""
     steps = 16
 
     @property
@@ -439,7 +458,7 @@ class Dice:
     def of(self, *values: Any) -> Any:
         return values[int(self.rng.integers(len(values)))]
 
-    def level(self, path: str, depth: int, greedy: bool = True) -> WorldLevel:
+    def level(self, path: str, depth: int, greedy: bool) -> WorldLevel:
         """A level; ``greedy``: so it is asked to act."""
         selector = self.of("network", *SELECTORS)
         learns = selector in SELECTORS[:2]
@@ -459,12 +478,18 @@ class Dice:
         if call_steps is None and not all(s.max_steps or s.call_steps or s.stops for s in skills):
             call_steps = 6
         owns = any(s.acts is not None for s in skills)
+        margin = self.of(None, 0.2) if learns else None
+        guided = learns and not confined  # a guide needs a skill that may start everywhere
+        guide = self.of(None, "last", "automaton") if guided else None
+        leaves_some = guide == "automaton" or isinstance(call_steps, tuple)
+        restricts = leaves_some and margin is None and self.of(True, True, False)
         return WorldLevel(
             path, self.kind, skills, selector, call_steps,
             rest=self.of(*RESTS[self.kind]) if owns else "zero",
             reflexes=self.of((), (), ("fixed",), ("fixed", "computed"), ("computed",)),
             greedy=greedy_skills, greedy_selector=greedy_selector,
-            margin=self.of(None, 0.2) if learns else None,
+            margin=margin, guide=guide, guide_restricts=restricts,
+            guide_tells=not restricts or self.of(True, False),
         )  # fmt: skip
 
     def skill(self, path: str, depth: int, greedy: bool, starts: bool) -> WorldSkill:
@@ -502,8 +527,9 @@ class Dice:
 def world(seed: int) -> World:
     """The world of a seed."""
     dice = Dice(seed)
-    level = dice.level(str(seed), dice.of(0, 1, 1, 2))
-    return World(seed, level, dice.masked, dice.of(1, 4), dice.of(True, False))
+    greedy = dice.of(True, True, False)
+    level = dice.level(str(seed), dice.of(0, 1, 1, 2), greedy)
+    return World(seed, level, dice.masked, dice.of(1, 4), dice.of(True, False), greedy)
 
 
 # Networks ---------------------------------------------------------------------------------------
@@ -680,6 +706,11 @@ def declared(level: WorldLevel, env: Any) -> sw.Hierarchy:
 
         takes_last = level.selector == "last"
         selector = (lambda obs, last: chosen(obs, last)) if takes_last else lambda obs: chosen(obs)
+    guide: Any = None
+    if level.guide is not None:
+        by_function: Any = lambda obs, last: level.by_function(obs, last)  # noqa: E731
+        beside = automaton(level, goals=False) if level.guide == "automaton" else by_function
+        guide = sw.Guide(beside, level.guide_restricts, 0.1 if level.guide_tells else None)
     return sw.Hierarchy(
         env,
         [declared_skill(skill, env) for skill in level.skills],
@@ -687,15 +718,19 @@ def declared(level: WorldLevel, env: Any) -> sw.Hierarchy:
         selector=selector,
         reflexes=level.rules,
         rest=level.rest,
+        guide=guide,
         selection=sw.Selection(greedy_skills=level.greedy, greedy_selector=level.greedy_selector),
         together=sw.Together(interrupt=level.margin is not None, margin=level.margin or 0.2),
     )
 
 
-def automaton(level: WorldLevel) -> sw.Automaton:
+def automaton(level: WorldLevel, goals: bool = True) -> sw.Automaton:
+    """The automaton of a level; ``goals``: it gives them."""
+
     def chosen(state: int, k: int) -> Any:
         name = level.skills[k].name
-        return (name, level.goal_in_state(state, name)) if name in level.goals else name
+        given = goals and name in level.goals
+        return (name, level.goal_in_state(state, name)) if given else name
 
     machine = level.machine
     return sw.Automaton(
@@ -711,6 +746,8 @@ class Made:
     roles: Roles
     policies: dict[str, Any]
     """By path; networks are stand-ins."""
+    deterministic: bool
+    """The first selector is asked for greedy choices."""
 
     def hierarchy(self) -> HierarchyPolicy:
         return assembled(self.roles, self.policies)
@@ -722,13 +759,18 @@ class Made:
     def greedy(self, path: str) -> bool:
         """Whether a stand-in, of a skill or a selector, is asked for greedy actions."""
         role = self.roles[path]
-        asked = role.kind != "selector" or not role.level or self.roles[role.level].greedy
-        return role.greedy and asked
+        if role.kind != "selector":
+            return role.greedy
+        return role.greedy and (self.roles[role.level].greedy if role.level else self.deterministic)
 
     def margins(self) -> dict[str, float]:
         """By the paths of critics, how much more a new decision must be worth."""
         levels = self.roles.levels.values()
         return {x.critic_path: x.together.margin for x in levels if x.together.interrupt}
+
+    def guide(self) -> ActiveGuide | None:
+        """What is beside the first selector where it learns, or decides in its place."""
+        return active_guide(self.roles, self.roles.outermost)
 
 
 @functools.lru_cache(4)
@@ -755,4 +797,4 @@ def made(world: World) -> Made:
             assert role.kind != "skill" or role.action_space == stand.acts
             stand.observation_space, stand.action_space = role.observation_space, role.action_space
             policies[name] = stand
-    return Made(roles, policies)
+    return Made(roles, policies, world.deterministic)

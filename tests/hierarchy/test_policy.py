@@ -7,8 +7,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from calls.cases import BY_HAND
-from calls.users import hierarchy as policy_of
 from declaring import plainly, skills_with
 from reference_calls import (
     EPISODE,
@@ -161,8 +159,16 @@ class InAnyOrder:
         return self.policy.observe(memory, step)
 
 
+def in_three_levels() -> HierarchyPolicy:
+    inside = hierarchy(Counter, Right, Left, call_steps=2)
+    for name in ("low", "middle"):
+        skill = type(name, (Skill,), {"policy": inside, "max_steps": 3})
+        inside = hierarchy(skill, Zigzag, call_steps=5)
+    return inside
+
+
 def test_memory_rows_may_be_gathered_and_scattered_in_any_order():
-    policy, actions = policy_of(BY_HAND["in three levels"].level), []
+    policy, actions = in_three_levels(), []
     for acts in (policy, InAnyOrder(policy)):
         episodes = SeededEpisodes(make_engine(EnvSpec(Walk, engine="sync"), N), [*range(9)], 99)
         actions.append([played.step.action.tolist() for played in play(acts, episodes)])
@@ -170,7 +176,7 @@ def test_memory_rows_may_be_gathered_and_scattered_in_any_order():
 
 
 def test_neither_act_nor_observe_changes_the_memory_given():
-    policy = policy_of(BY_HAND["in three levels"].level)
+    policy = in_three_levels()
     obs = np.zeros((N, 4), np.float32)
     obs[:, TAG] = np.arange(N)
     memory = policy.start(N)

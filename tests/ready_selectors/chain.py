@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +13,7 @@ from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.skills import Skill, ready_selector
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.skills.skill_set import SkillSet
-from skillweave.types import Array, Step
+from skillweave.types import Array, Memory, Step
 
 PLACE, KEY, DOOR = range(3)
 LAST = 6
@@ -133,24 +134,30 @@ def hierarchy(selector: Any, call_steps: int | None = None, skills: Any = ()) ->
     return HierarchyPolicy(bound(selector, names), SkillSet(skills, policies, (), call_steps))
 
 
-def story(policy: HierarchyPolicy, seed: int, most: int = 40) -> list[tuple[str, int]]:
-    """The calls of an episode: each skill's name and how many steps it lasted."""
+def played(policy: HierarchyPolicy, seed: int, **how: Any) -> Iterator[tuple[Memory, Memory]]:
+    """What a policy remembers before and after it acts in each step of an episode."""
     env = Corridor()
     obs, _ = env.reset(seed=seed)
-    memory, calls = policy.start(1), []
-    for t in range(most):
-        here = obs[None]
-        action, memory = policy.act(memory, here)
-        if memory["elapsed"][0] == 0:
-            calls.append([policy.labels[int(policy.acting(memory)[0])], 0])
-        calls[-1][1] += 1
+    memory, over, t = policy.start(1), False, 0
+    while not over:
+        before, here = memory, obs[None]
+        action, memory = policy.act(memory, here, **how)
+        yield before, memory
         obs, reward, terminated, truncated, info = env.step(int(action[0]))
+        over, t = terminated or truncated, t + 1
         step = Step(
             here, action, obs[None], np.float32([reward]), np.array([terminated]),
-            np.array([truncated]), np.zeros(1, bool), np.array([t + 1]),
+            np.array([truncated]), np.zeros(1, bool), np.array([t]),
             {"door": np.array([info["door"]])},
         )  # fmt: skip
         memory = policy.observe(memory, step)
-        if terminated or truncated:
-            break
+
+
+def story(policy: HierarchyPolicy, seed: int) -> list[tuple[str, int]]:
+    """The calls of an episode: each skill's name and how many steps it lasted."""
+    calls: list[Any] = []
+    for _, memory in played(policy, seed):
+        if memory["elapsed"][0] == 0:
+            calls.append([policy.labels[int(memory["skill"][0])], 0])
+        calls[-1][1] += 1
     return [tuple(c) for c in calls]

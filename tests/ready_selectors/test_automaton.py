@@ -6,78 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ready_selectors.chain import NAMES, Corridor, bound, got_key, hierarchy, story
+from ready_selectors.chain import Corridor, bound, got_key, hierarchy, story
 
 import skillweave as sw
 from skillweave import Automaton
 from skillweave.errors import DeclarationError, SkillError
-from skillweave.policies.core import CallEnd
-from skillweave.skills import LastCall
 from skillweave.types import Step
 
 STATES = {"search": "get_key", "unlock": "open_door", "free": "leave"}
 ARROWS = {("search", "unlock"): got_key, ("unlock", "free"): "success"}
-
-
-def step(numbers: Any) -> Step:
-    """A step of n environments whose next observations begin with these numbers."""
-    n = len(numbers)
-    obs, no = np.zeros((n, 3), np.float32), np.zeros(n, bool)
-    after = obs.copy()
-    after[:, 0] = numbers
-    return Step(obs, np.zeros(n, int), after, np.zeros(n, np.float32), no, no, no, np.ones(n), {})
-
-
-def call(why: Any, succeeded: Any) -> LastCall:
-    n = len(why)
-    return LastCall(np.zeros(n, int), np.array(why, np.int8), np.array(succeeded, bool))
-
-
-def above(limit: float) -> Any:
-    return lambda step: step.next_obs[:, 0] > limit
-
-
-def states(policy: Any, memory: Any) -> list[str]:
-    return [policy.state_names[i] for i in memory["state"]]
-
-
-def test_transitions_by_hand():
-    policy = bound(
-        Automaton(
-            {"low": "wait", "high": "leave", "over": {"wait", "leave"}},
-            {
-                ("low", "high"): above(1),
-                ("low", "over"): above(0),  # only where the one before has not happened
-                ("high", "high"): above(8),  # stays, so the next one is not looked at
-                ("high", "low"): above(7),
-                ("high", "over"): "success",
-                ("over", "low"): "failure",
-            },
-        )
-    )
-    memory = policy.start(5)
-    running = call([CallEnd.RUNNING] * 5, [False] * 5)
-    assert states(policy, memory) == ["low"] * 5
-    memory = policy.watch(memory, step([0, 1, 2, 9, 0.5]), running)
-    # At most one transition in a step: 9 does not go on from high.
-    assert states(policy, memory) == ["low", "over", "high", "high", "over"]
-    memory = policy.watch(memory, step([0, 0, 7.5, 9, 0]), running)
-    assert states(policy, memory) == ["low", "over", "low", "high", "over"]
-    ended = call(
-        [CallEnd.OWN, CallEnd.LIMIT, CallEnd.OWN, CallEnd.OWN, CallEnd.LIMIT], [1, 0, 1, 1, 1]
-    )
-    memory = policy.watch(memory, step([0] * 5), ended)
-    assert states(policy, memory) == ["low", "low", "low", "over", "over"]
-    # A call that goes on has neither succeeded nor failed.
-    memory = policy.watch(memory, step([0] * 5), running)
-    assert states(policy, memory) == ["low", "low", "low", "over", "over"]
-
-
-def test_the_skills_of_each_state_as_a_mask():
-    policy = bound(Automaton(STATES | {"end": {"wait", "leave"}}, ARROWS))
-    memory = {"state": np.array([0, 3, 2, 1])}
-    wanted = [{"get_key"}, {"leave", "wait"}, {"leave"}, {"open_door"}]
-    assert policy.allowed(memory).tolist() == [[n in some for n in NAMES] for some in wanted]
 
 
 def test_greedy_the_first_is_called_and_else_one_at_random():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from declaring import plainly
 from ready_selectors import chain
-from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, got_key, has_key
+from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, got_key, has_key
 from small_runs import OFF, ON, SMALL, Whole, lines, reports_every
 
 from skillweave import (
@@ -19,7 +19,6 @@ from skillweave import (
     Lengths,
     Skill,
     SkillweaveError,
-    Step,
     Together,
     TrainDefaults,
     evaluate,
@@ -178,26 +177,12 @@ def test_skills_that_learn_under_a_ready_selector_solve_the_corridor(tmp_path):
 
 def calls_of(policy, guide, seeds=6):
     """(state of the automaton at each decision, the skill that was called)."""
-    found = []
-    for seed in range(seeds):
-        env = Corridor()
-        obs, _ = env.reset(seed=seed)
-        memory = policy.start(1)
-        for t in range(40):
-            decides = memory["end"][0] != 0
-            state = guide.state_names[int(memory["guide.state"][0])]
-            action, memory = policy.act(memory, obs[None], deterministic=False)
-            if decides:
-                found.append((state, policy.labels[int(memory["skill"][0])]))
-            before = obs
-            obs, reward, terminated, truncated, _ = env.step(int(action[0]))
-            memory = policy.observe(memory, Step(
-                before[None], action, obs[None], np.float32([reward]), np.array([terminated]),
-                np.array([truncated]), np.zeros(1, bool), np.array([t + 1]), {},
-            ))  # fmt: skip
-            if terminated or truncated:
-                break
-    return found
+    return [
+        (guide.state_names[int(before["guide.state"][0])], policy.labels[int(after["skill"][0])])
+        for seed in range(seeds)
+        for before, after in chain.played(policy, seed, deterministic=False)
+        if before["end"][0] != 0
+    ]
 
 
 CHAIN = Automaton(

@@ -13,11 +13,9 @@ from skillweave import tree
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.policies.core import CallEnd
 from skillweave.skills import LastCall
-from skillweave.skills.ready_selector import TreeSelector, ready_selector
+from skillweave.skills.selector import TreeSelector, ready_selector
 
 ABC = ("a", "b", "c")
-S, F = True, False
-"""How calls end: with success, or with failure."""
 
 
 def flag(i: int) -> Any:
@@ -52,60 +50,10 @@ def test_a_leaf_whose_skill_was_not_called_is_asked_for_again():
     assert names == "abbbc"
 
 
-def chosen(root: Any, ends: list[bool], flags: Any = (), masks: Any = ()) -> str:
-    """The skills that are called one after another, where calls end so; one letter each."""
-    policy, names = made(root), ""
-    memory = policy.start(1)
-    for i in range(len(ends) + 1):
-        obs = np.float32([flags[i] if len(flags) else (0, 0, 0)])
-        mask = np.array([masks[i]], bool) if len(masks) else None
-        skill, memory = policy.act(memory, obs, mask)
-        names += ABC[int(skill[0])]
-        if i < len(ends):
-            memory = told(policy, memory, [ends[i]])
-    return names
-
-
-@pytest.mark.parametrize(
-    ("root", "ends", "calls"),
-    [
-        # A sequence goes on after a success, and begins anew after a failure or its end.
-        (tree.Sequence("a", "b"), [S, S, S, S], "ababa"),
-        (tree.Sequence("a", "b", "c"), [S, F, S, S, S], "ababca"),
-        (tree.Sequence("a"), [S, F, S], "aaaa"),
-        # A fallback goes on after a failure.
-        (tree.Fallback("a", "b"), [F, F, F, S], "ababa"),
-        (tree.Fallback("a", "b", "c"), [F, F, S, S], "abcaa"),
-        # One within the other: (a or b), then c.
-        (tree.Sequence(tree.Fallback("a", "b"), "c"), [S, S], "aca"),
-        (tree.Sequence(tree.Fallback("a", "b"), "c"), [F, S, S], "abca"),
-        (tree.Sequence(tree.Fallback("a", "b"), "c"), [F, F, S], "abac"),
-        (tree.Fallback(tree.Sequence("a", "b"), "c"), [S, F, F], "abca"),
-        # Twice the same skill: two leaves.
-        (tree.Sequence("a", "a", "b"), [S, S, S], "aaba"),
-        # Without memory the first child's turn comes again, so c is never called, and how b ends
-        # is not asked: whoever was passed over is no longer under way.
-        (tree.Sequence("a", "b", "c", memory=False), [S, S, S, S], "ababa"),
-        (tree.Fallback("a", "b", "c", memory=False), [F, F, F, F], "ababa"),
-        (tree.Fallback("a", "b", "c", memory=False), [F, S, S], "abaa"),
-    ],
-)
-def test_the_skills_that_are_called_by_hand(root, ends, calls):
-    assert chosen(root, ends) == calls
-
-
-def test_a_condition_is_asked_again_where_there_is_no_memory():
-    flags = [(0, 0, 0), (1, 0, 0), (1, 0, 0), (0, 0, 0), (0, 0, 0)]
-    # a as long as the flag is not set; then b, then c.
-    goes_on = tree.Sequence(tree.Fallback(flag(0), "a"), "b", "c")
-    assert chosen(goes_on, [S, S, S, S], flags) == "abcab"
-    # Looked at again at every decision: where the flag is gone, a is called instead of c's end.
-    looks = tree.Sequence(tree.Fallback(flag(0), "a"), tree.Sequence("b", "c"), memory=False)
-    assert chosen(looks, [S, S, S, S], flags) == "abcab"
-    flags = [(1, 0, 0), (0, 0, 0), (1, 0, 0), (1, 0, 0), (1, 0, 0)]
-    assert chosen(goes_on, [S, S, S, S], flags) == "bcbcb"
-    # The inner sequence, too, begins anew after it was passed over.
-    assert chosen(looks, [S, S, S, S], flags) == "babcb"
+def choose(root: Any, obs: Any = (0, 0, 0), mask: Any = (True, True, True)) -> Any:
+    """The first choice of a tree."""
+    policy = made(root)
+    return policy.act(policy.start(1), np.float32([obs]), np.array([mask]))
 
 
 def test_a_bare_function_is_a_condition_and_is_named_after_it():
@@ -114,21 +62,13 @@ def test_a_bare_function_is_a_condition_and_is_named_after_it():
     assert node.children[0].name == "has_key"
 
 
-def test_a_skill_that_may_not_start_has_failed_at_once():
-    only_b, all_of_them = (False, True, False), (True, True, True)
-    root = tree.Fallback("a", "b")
-    assert chosen(root, [S, S], masks=[only_b, all_of_them, only_b]) == "bab"
-    root = tree.Fallback(tree.Sequence("a", "c"), "b")
-    assert chosen(root, [S, S], masks=[all_of_them, only_b, all_of_them]) == "aba"
-
-
 def test_a_tree_that_ends_without_a_skill_says_where():
     with pytest.raises(SkillError, match=r"tree ended \(FAILURE\).*\[0. 7. 0.\]"):
-        chosen(tree.Sequence(flag(0), "a"), [], [(0, 7, 0)])
+        choose(tree.Sequence(flag(0), "a"), (0, 7, 0))
     with pytest.raises(SkillError, match=r"tree ended \(SUCCESS\).*Fallback"):
-        chosen(tree.Fallback(flag(0), "a"), [], [(1, 0, 0)])
+        choose(tree.Fallback(flag(0), "a"), (1, 0, 0))
     with pytest.raises(SkillError, match="without a skill that may start"):
-        chosen(tree.Sequence("a", "b"), [], masks=[(False, True, True)])
+        choose(tree.Sequence("a", "b"), mask=(False, True, True))
 
 
 WRONG = {
@@ -154,7 +94,7 @@ def test_a_wrong_tree_is_refused(case):
 
 def test_a_condition_that_answers_wrongly_is_named():
     with pytest.raises(SkillError, match=r"selector: tree: tall\(\) returned shape \(3,\)"):
-        chosen(tree.Sequence(tree.Condition(lambda obs: obs[0] > 1, "tall"), "a"), [])
+        choose(tree.Sequence(tree.Condition(lambda obs: obs[0] > 1, "tall"), "a"))
     with pytest.raises(SkillError, match=r"tall.*yes or no"):
         made(tree.Sequence(tree.Condition(lambda obs: obs[:, 0] + 0.5, "tall"), "a")).try_out()
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from skills.mapped_models import onnx_model
 
 WEIGHT = np.array([[-0.1, 0.1], [-0.2, 0.2], [-2.0, 2.0], [-1.0, 1.0]], np.float32)
 """Logits of CartPole's two actions: a controller that balances."""
@@ -28,28 +29,18 @@ def onnx_file(
     path: Path, weight: Any = WEIGHT, batch: Any = "n", whole: bool = False, apart: bool = False
 ) -> Path:
     """obs · weight as an ONNX file; ``whole``: returns the largest one; ``apart``: two files."""
-    import onnx
-    from onnx import TensorProto, helper
-
     weight = np.asarray(weight, np.float32)
-    nodes = [helper.make_node("MatMul", ["obs", "w"], ["logits"])]
-    nodes += [helper.make_node("ArgMax", ["logits"], ["action"], axis=1, keepdims=0)]
-    outputs = [
-        helper.make_tensor_value_info("action", TensorProto.INT64, [batch]),
-        helper.make_tensor_value_info("logits", TensorProto.FLOAT, [batch, weight.shape[1]]),
-    ]
-    graph = helper.make_graph(
-        nodes,
-        "linear",
-        [helper.make_tensor_value_info("obs", TensorProto.FLOAT, [batch, weight.shape[0]])],
-        outputs if whole else outputs[::-1],
-        [onnx.numpy_helper.from_array(weight, "w")],
-    )
-    opset = [helper.make_opsetid("", 17)]
-    model = helper.make_model(graph, opset_imports=opset, ir_version=9)
+    largest = "ArgMax", ["logits"], ["action"], {"axis": 1, "keepdims": 0}
+    outputs = [("action", [batch]), ("logits", [batch, weight.shape[1]])]
     beside = {"save_as_external_data": True, "location": "w.data", "size_threshold": 0}
-    onnx.save(model, path, **(beside if apart else {}))
-    return path
+    return onnx_model(
+        path,
+        [("MatMul", ["obs", "w"], ["logits"]), largest],
+        {"obs": [batch, weight.shape[0]]},
+        dict(outputs if whole else outputs[::-1]),
+        {"w": weight},
+        **(beside if apart else {}),
+    )
 
 
 def sb3_zip(path: Path, name: str = "ppo", env: Any = "CartPole-v1", **settings: Any) -> Path:

@@ -78,24 +78,29 @@ def weights(*shape: int) -> Array:
 
 
 def onnx_model(
-    path: Path, nodes: Any, inputs: Any, outputs: Any, constants: dict[str, Array]
+    path: Path, nodes: Any, inputs: Any, outputs: Any, constants: dict[str, Array], **how: Any
 ) -> Path:
-    """Write an ONNX file: nodes (operation, inputs, outputs), shapes by name."""
+    """Write an ONNX file: nodes (operation, inputs, outputs, perhaps attributes), shapes by name.
+
+    Its numbers are real, those of ``ArgMax`` are whole; ``how``: as of ``onnx.save``.
+    """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
     def values(shapes: dict[str, Any]) -> Any:
-        return [helper.make_tensor_value_info(k, TensorProto.FLOAT, v) for k, v in shapes.items()]
+        whole = [node[2][0] for node in nodes if node[0] == "ArgMax"]
+        kinds = {k: TensorProto.INT64 if k in whole else TensorProto.FLOAT for k in shapes}
+        return [helper.make_tensor_value_info(k, kinds[k], v) for k, v in shapes.items()]
 
     graph = helper.make_graph(
-        [helper.make_node(kind, given, made) for kind, given, made in nodes],
+        [helper.make_node(*node[:3], **dict(*node[3:])) for node in nodes],
         "model",
         values(inputs),
         values(outputs),
         [numpy_helper.from_array(v, k) for k, v in constants.items()],
     )
     opset = helper.make_opsetid("", 17)
-    onnx.save(helper.make_model(graph, opset_imports=[opset], ir_version=9), path)
+    onnx.save(helper.make_model(graph, opset_imports=[opset], ir_version=9), path, **how)
     return path
 
 

@@ -17,25 +17,12 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_mapped_policy_acts_as_its_source(cases: dict[str, Case], name: str) -> None:
-    case, n = cases[name], 3
-    policy, sources = fit(case.policy), [case.source() for _ in range(n)]
-    memory = policy.start(n)
-    for obs in observations(n, 20):
-        action, memory = policy.act(memory, obs)
-        assert action.dtype == np.float32
-        wanted = [s.act(one(obs, i)) for i, s in enumerate(sources)]
-        np.testing.assert_allclose(action, wanted, atol=1e-5)
-    assert len(np.unique(np.round(wanted, 3))) > 3  # it does something
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_environments_start_again_and_act_at_different_times(
+def test_it_acts_as_its_source_wherever_others_act_or_start_again(
     cases: dict[str, Case], name: str
 ) -> None:
     case, n = cases[name], 5
     policy, sources = fit(case.policy), [case.source() for _ in range(n)]
-    memory, rng = policy.start(n), np.random.default_rng(1)
+    memory, rng, acted = policy.start(n), np.random.default_rng(1), set[float]()
     for obs in observations(n, 30, seed=1):
         fresh = np.flatnonzero(rng.random(n) < 0.2)
         for k, v in policy.start(len(fresh)).items():
@@ -51,17 +38,10 @@ def test_environments_start_again_and_act_at_different_times(
             np.testing.assert_array_equal(v, before[k])  # a memory is not changed in place
             v[rows] = after[k]
         wanted = [sources[i].act(one(obs, i)) for i in rows]
+        assert action.dtype == np.float32
         np.testing.assert_allclose(action, wanted, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_alone_it_acts_as_among_others(cases: dict[str, Case], name: str) -> None:
-    policy = fit(cases[name].policy)
-    together, alone = policy.start(4), policy.start(1)
-    for obs in observations(4, 12, seed=2):
-        actions, together = policy.act(together, obs)
-        action, alone = policy.act(alone, obs[2:3])
-        np.testing.assert_allclose(action[0], actions[2], atol=1e-6)
+        acted |= set(np.round(action, 3).reshape(-1).tolist())
+    assert len(acted) > 3  # it does something
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -6,8 +6,6 @@ from gymnasium.spaces import Box, Discrete
 
 from skillweave._internal.messages import short
 from skillweave.errors import SkillweaveError
-from skillweave.policies.core import Policy
-from skillweave.policies.parts import Reflexes
 from skillweave.policies.spaces import space_of
 from skillweave.skills import Reflex, Skill, asked, from_function
 from skillweave.skills.outputs import checked
@@ -68,21 +66,6 @@ def test_a_reflex_overrides_the_action_where_it_holds_and_leaves_its_argument_al
     )
     assert (overridden.tolist(), holds.tolist()) == ([5, 0, 0], [False, True, True])
     assert action.tolist() == [5, 5, 5]
-
-
-def test_a_reflex_may_compute_its_actions_from_the_observations_where_it_holds():
-    reflex = Reflex(lambda obs: obs[:, 0] > 0, lambda obs: 10 * obs)
-    overridden, _ = reflex.apply(OBS, np.full((3, 1), 5.0), space_of(Box(-50, 50, (1,))))
-    assert overridden.tolist() == [[5], [10], [20]]
-
-
-def test_the_last_reflex_wins():
-    reflexes = (Reflex(lambda o: o[:, 0] > 0, 1), Reflex(lambda o: o[:, 0] > 1, 2))
-    action, overridden = Reflexes(Policy(), reflexes, space_of(Discrete(3))).over(
-        OBS, np.zeros(3, int)
-    )
-    assert action.tolist() == [0, 1, 2]
-    assert overridden.tolist() == [False, True, True]
 
 
 def test_a_reflex_is_named_after_its_condition():

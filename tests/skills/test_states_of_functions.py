@@ -115,8 +115,9 @@ def places() -> dict[str, list[Callable[[], Any]]]:
             chooses(tree.Fallback(tree.Sequence(Best(), "a"), "b")),
             lambda: with_goals.act({"state": np.zeros(4, int)}, OBS),
             lambda: machine.acts.read(step()),
+            chooses(Best()),
+            chooses(Two()),
         ],
-        "skills.ready_selector": [chooses(Best()), chooses(Two())],
         "skills.base": [
             lambda: condition.holds(OBS),
             lambda: reflex.apply(OBS, np.zeros(4, int), space_of(SPACES[1])),
@@ -138,7 +139,7 @@ def test_each_function_that_keeps_a_state_gets_one_notice(place: str) -> None:
 
 
 def test_every_module_that_calls_functions_of_the_user_is_tested() -> None:
-    others = ("outputs", "probing", "reads")  # of all, or before them
+    others = ("outputs", "probing")  # of all, or before them
     calls = {
         name.removeprefix("skillweave.")
         for name, module in sys.modules.items()

@@ -43,7 +43,7 @@ from skillweave.hierarchy import training
 from skillweave.reporting.report.curves import read_curves
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Manifest, identity, read_manifest
-from skillweave.skills.info_words import info_keys
+from skillweave.skills.outputs import info_keys
 
 
 class Told(Ledger):
