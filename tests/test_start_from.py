@@ -32,7 +32,7 @@ from skillweave.errors import RunError
 from skillweave.experience.acting import Acting
 from skillweave.hierarchy import training
 from skillweave.reporting.report.facts import settings
-from skillweave.runs import initial_policies
+from skillweave.runs import directory
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.runs.initial_policies import (
@@ -40,7 +40,6 @@ from skillweave.runs.initial_policies import (
     learners_of_run,
     record_initial_policies,
 )
-from skillweave.training import stage_log
 from skillweave.training.joint import JointLearner
 
 STILL = 1e-12
@@ -229,14 +228,14 @@ def test_who_starts_from_a_run_is_not_held_near_what_it_was(source, tmp_path, mo
 
 
 def test_where_nothing_can_be_copied_no_run_is_begun(source, tmp_path, monkeypatch):
-    write = initial_policies.write_tensors
+    write = directory.write_tensors
 
     def full(path, *about, **how):
         if "other" in path.name:
             raise RunError("No space left on device")
         return write(path, *about, **how)
 
-    monkeypatch.setattr(initial_policies, "write_tensors", full)
+    monkeypatch.setattr(directory, "write_tensors", full)
     with pytest.raises(SkillweaveError, match="No space left"):
         declare().train(tmp_path / "run", quiet=True, start_from=source)
     monkeypatch.undo()
@@ -259,7 +258,7 @@ def test_seeds_that_start_from_runs_of_their_own_are_one_group(tmp_path):
 def test_what_is_left_of_a_start_goes_with_the_next_training(source, tmp_path, monkeypatch):
     """Killed between the end of a stage and the removal of what it began with."""
     run = begun(tmp_path / "run", source)
-    monkeypatch.setattr(stage_log, "remove_initial_policies", lambda *_: 1 / 0)
+    monkeypatch.setattr(RunDirectory, "drop_used", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         training.train(declare(), run)
     run.close()

@@ -180,7 +180,7 @@ def _check_grows(run: RunDirectory, entry: StageEntry, more: int) -> None:
         )
     if not entry.done:
         return
-    if is_copy_of_hub(run.path) or not run.final_path(name).exists():
+    if is_copy_of_hub(run.path) or not run.file("final", name).exists():
         raise RunError(
             f"{run.path} cannot be given more steps: it does not hold the final state of stage "
             f"{name!r} (a copy from the hub does not, nor does a run whose disk was full). {new}"

@@ -347,7 +347,7 @@ def must_be_same_code(out: Path, recipe: str) -> None:
     code = _checksum(code_files(recipes.file_of(recipe)))
     learnt = any(out.glob("*/checkpoint*")) or any(out.glob("*/policies/*"))
     if not learnt or not file.exists():
-        write_json(file, Mark(recipe=recipe, code=code), make_directories=False)
+        write_json(file, Mark(recipe=recipe, code=code))
         return
     mark: Mark = fit(Mark, read_json(file), str(file))
     if mark["code"] != code:

@@ -57,7 +57,7 @@ def save_evaluation(
     must_be_own(run.path)
     made = time.strftime("%Y-%m-%dT%H:%M:%S%z")
     saved = SavedEvaluation(made, seed, deterministic, evaluation, run.manifest.id)
-    write_json(run.path / _name(deterministic), saved, make_directories=False)
+    write_json(run.path / _name(deterministic), saved)
     _track(run, evaluation)
 
 

@@ -30,7 +30,6 @@ from skillweave.ops.moments import normalize
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.initial_policies import initial_policy
 from skillweave.runs.manifest import StageEntry
-from skillweave.runs.states import load_state, state_path
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
 from skillweave.training.learning_task import JointTask
 from skillweave.training.replay_learner import ReplayLearner, store_of
@@ -174,7 +173,7 @@ class JointAgents(OneAgent):
     def _report_lost_state(self, name: str, log: StageLog) -> None:
         """Report a deleted file of a state."""
         latest = self._latest_stage(name)
-        path = state_path(self.stage.run, name)
+        path = self.stage.run.file("states", name)
         trained = latest is not None and latest.evolution is None and not latest.undone
         if trained and not path.exists():
             log.message(
@@ -186,7 +185,7 @@ class JointAgents(OneAgent):
         self, name: str, algorithm: Algorithm, fresh: Any, policy: AgentPolicy, steps: int
     ) -> Any:
         """Return the state of ``name`` at the end of its latest stage; else its weights alone."""
-        state = load_state(self.stage.run, name, fresh)
+        state = self.stage.run.load_state(name, fresh)
         if state is None:
             begin_as(algorithm, fresh, policy, steps)
             state = fresh

@@ -25,7 +25,7 @@ from skillweave.ops.device import resolve_device
 from skillweave.planning.recorder import Recorder
 from skillweave.planning.run_log import save_calls
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.initial_policies import initial_policy, remove_initial_policies
+from skillweave.runs.initial_policies import initial_policy
 from skillweave.runs.manifest import Checkpoint, StageEntry
 from skillweave.runs.trackers import Listener
 from skillweave.training.episodes import Episodes, Tick
@@ -33,7 +33,7 @@ from skillweave.training.learner import Learner, Stack, keep_to_guide
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Progress, Saved, begin_episodes, resume, train
 from skillweave.training.periodic import PeriodicEvaluation, episodes_of
-from skillweave.training.rehearsal import rehearse, remove_rehearsal
+from skillweave.training.rehearsal import rehearse
 from skillweave.training.replay_learner import ReplayLearner, learner_of
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import StageLog, resumed
@@ -321,8 +321,7 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
     run = course.run
     entry = run.stage(stage.name)
     if entry.done:
-        remove_initial_policies(run, stage.name)  # the run may have been killed just before
-        remove_rehearsal(run, entry)
+        run.drop_used(entry)  # the run may have been killed just before
         return run.load_policies(stage.name)
     seeds = Seeds(run.manifest.seed) / stage.name
     learning_task = stage.learning_task(earlier)
@@ -337,8 +336,7 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
     ):
         try:
             fresh = learner.open()
-            kind = None if fresh is None else type(fresh)
-            checkpoint = run.load_checkpoint(kind, stage.name, like=fresh)
+            checkpoint = run.load_checkpoint(stage.name, fresh)
             state, at, extra = checkpoint or (fresh, Checkpoint.start(stage.name), {})
             log = StageLog(stage.name, run, course.listeners, at)
             learner.go_on(state, extra, log)

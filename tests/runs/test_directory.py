@@ -182,7 +182,7 @@ def test_versions_name_python_torch_gymnasium_and_the_machine() -> None:
 def test_a_checkpoint_comes_back_exactly(run: RunDirectory) -> None:
     run.log({"update": 1})
     state = save(run, 3)
-    found = RunDirectory.open(run.path).load_checkpoint(Learnt, "landing")
+    found = RunDirectory.open(run.path).load_checkpoint("landing", learnt(0))
     assert found is not None
     assert_same(found[0], state)
     assert (found[1].update, found[1].steps) == (3, 30)
@@ -190,12 +190,12 @@ def test_a_checkpoint_comes_back_exactly(run: RunDirectory) -> None:
 
 
 def test_there_is_no_checkpoint_at_first(run: RunDirectory) -> None:
-    assert run.load_checkpoint(Learnt, "landing") is None
+    assert run.load_checkpoint("landing", learnt(0)) is None
 
 
 def test_the_latest_checkpoint_counts_and_no_other_files_stay(run: RunDirectory) -> None:
     states = [save(run, seed) for seed in (1, 2, 3)]
-    found = run.load_checkpoint(Learnt, "landing")
+    found = run.load_checkpoint("landing", learnt(0))
     assert found is not None
     assert_same(found[0], states[2])
     names = {p.name for p in run.path.iterdir()} - {".lock"}
@@ -216,7 +216,7 @@ def test_a_bad_checkpoint_falls_back_to_the_one_before(run: RunDirectory, how: s
             os.truncate(path, 0)
         case "removed":
             path.unlink()
-    found = run.load_checkpoint(Learnt, "landing")
+    found = run.load_checkpoint("landing", learnt(0))
     assert found is not None
     assert_same(found[0], before)
     assert found[1].update == 1
@@ -229,15 +229,15 @@ def test_two_damaged_checkpoints_are_an_error_that_names_both(run: RunDirectory)
     for path in paths:
         damage(path)
     with pytest.raises(RunError, match="damaged") as caught:
-        run.load_checkpoint(Learnt, "landing")
+        run.load_checkpoint("landing", learnt(0))
     assert all(str(p) in str(caught.value) for p in paths)
 
 
 def test_checkpoints_of_another_stage_are_ignored(run: RunDirectory) -> None:
     mine = save(run, 1, "landing")
-    assert run.load_checkpoint(Learnt, "selector") is None
+    assert run.load_checkpoint("selector", learnt(0)) is None
     save(run, 2, "selector")
-    found = run.load_checkpoint(Learnt, "landing")
+    found = run.load_checkpoint("landing", learnt(0))
     assert found is not None
     assert_same(found[0], mine)
 
@@ -249,7 +249,7 @@ def test_a_checkpoint_of_another_algorithm_is_refused(run: RunDirectory) -> None
 
     run.save_checkpoint(Other(torch.zeros(1)), Checkpoint("landing", 1, 1, 0, 0.0, {}))
     with pytest.raises(RunError, match="has other fields than this version"):
-        run.load_checkpoint(Learnt, "landing")
+        run.load_checkpoint("landing", learnt(0))
 
 
 def test_a_checkpoint_that_cannot_be_written_leaves_the_last_two(
@@ -265,7 +265,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_last_two(
     with pytest.raises(RunError, match="No space left"):
         save(run, 3)
     monkeypatch.undo()
-    found = run.load_checkpoint(Learnt, "landing")
+    found = run.load_checkpoint("landing", learnt(0))
     assert found is not None
     assert_same(found[0], kept)
     names = {p.name for p in run.path.iterdir()} - {".lock"}
@@ -347,7 +347,7 @@ def test_rewinding_drops_what_came_after_the_checkpoint(run: RunDirectory) -> No
     save(run, 3)
     for i in range(3, 6):
         run.log({"update": i})
-    found = run.load_checkpoint(Learnt, "landing")
+    found = run.load_checkpoint("landing", learnt(0))
     assert found is not None
     run.rewind({"metrics_bytes": found[1].metrics_bytes})
     assert [r["update"] for r in run.metrics()] == [0, 1, 2]
@@ -524,7 +524,7 @@ def test_a_checkpoint_of_another_run_is_refused(run: RunDirectory, tmp_path: Pat
     save(theirs, 1)
     shutil.copy(theirs.path / "checkpoint.safetensors", run.path)
     with pytest.raises(RunError, match="belongs to another run"):
-        run.load_checkpoint(Learnt, "landing")
+        run.load_checkpoint("landing", learnt(0))
 
 
 @pytest.mark.parametrize("how", ["shape", "dtype"])
@@ -534,8 +534,8 @@ def test_a_checkpoint_of_other_shapes_or_types_is_refused_by_tensor(
     state = save(run, 1)
     weight = state.weight.T if how == "shape" else state.weight.double()
     with pytest.raises(RunError, match="tensor weight should"):
-        run.load_checkpoint(Learnt, "landing", like=Learnt(weight, state.count))
-    assert run.load_checkpoint(Learnt, "landing", like=learnt(7)) is not None
+        run.load_checkpoint("landing", Learnt(weight, state.count))
+    assert run.load_checkpoint("landing", learnt(7)) is not None
 
 
 def test_a_checkpoint_with_a_damaged_header_falls_back_to_the_one_before(
@@ -545,7 +545,7 @@ def test_a_checkpoint_with_a_damaged_header_falls_back_to_the_one_before(
     save(run, 2)
     tensors, header = read_tensors(run.path / "checkpoint.safetensors")
     write_tensors(run.path / "checkpoint.safetensors", tensors, header | {"steps": "many"})
-    found = run.load_checkpoint(Learnt, "landing")
+    found = run.load_checkpoint("landing", learnt(0))
     assert found is not None
     assert found[1].update == 1
 
@@ -637,7 +637,7 @@ def test_a_checkpoint_between_its_two_renames_is_not_lost(run: RunDirectory) -> 
     latest = run.path / "checkpoint.safetensors"
     latest.rename(run.path / "checkpoint.new.safetensors")
     run.begin()
-    found = run.load_checkpoint(Learnt, "landing")
+    found = run.load_checkpoint("landing", learnt(0))
     assert found is not None
     assert_same(found[0], state)
 
@@ -650,9 +650,9 @@ def test_checkpoints_go_when_their_stage_is_done_and_not_before(run: RunDirector
     run.save()
     run.begin()
     assert not (run.path / "checkpoint.previous.safetensors").exists()
-    assert run.load_checkpoint(Learnt, "selector") is not None
+    assert run.load_checkpoint("selector", learnt(0)) is not None
     run.drop_checkpoints()
-    assert run.load_checkpoint(Learnt, "selector") is None
+    assert run.load_checkpoint("selector", learnt(0)) is None
     assert not list(run.path.glob("checkpoint*"))
 
 
@@ -699,7 +699,7 @@ def test_a_checkpoint_that_cannot_be_renamed_is_an_error_for_people(
     with pytest.raises(RunError, match=r"could not write .*checkpoint"):
         save(run, 3)
     monkeypatch.undo()
-    found = run.load_checkpoint(Learnt, "landing")
+    found = run.load_checkpoint("landing", learnt(0))
     assert found is not None
     assert_same(found[0], kept)
     assert not (run.path / "checkpoint.new.safetensors").exists()
@@ -713,7 +713,7 @@ def test_a_populations_checkpoint_without_one_of_its_fields_is_refused(
     population = Generation(0, 1, 0, 1, [member], BestEntry(1.0, 0, 0, AgentHeader({}, {}, {})))
     saved = Checkpoint("landing", 1, 1, 0, 0.0, {}, population=population)
     run.save_checkpoint(learnt(1), saved)
-    found = run.load_checkpoint(Learnt, "landing")
+    found = run.load_checkpoint("landing", learnt(0))
     assert found is not None
     assert found[1].population == population
     path = run.path / "checkpoint.safetensors"
@@ -721,4 +721,4 @@ def test_a_populations_checkpoint_without_one_of_its_fields_is_refused(
     del header["population"][field]
     write_tensors(path, tensors, header)
     with pytest.raises(RunError, match=f"damaged: population has no field '{field}'"):
-        run.load_checkpoint(Learnt, "landing")
+        run.load_checkpoint("landing", learnt(0))
