@@ -56,7 +56,7 @@ def load_from(
     declared: Hierarchy | Agent | None = None,
     *,
     recipe: str | None = None,
-    ask: str,
+    ask: str = ASK,
 ) -> Run:
     """Load a finished run; errors are those of ``load``.
 

@@ -13,7 +13,7 @@ from skillweave._internal.paths import join, level_of, name_of
 from skillweave.algorithms.config import OnPolicy, config_to_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.applying import Trained, apply_manifest
-from skillweave.api.running import Base, begin, go_on
+from skillweave.api.running import begin, go_on
 from skillweave.api.train_options import RepairOptions
 from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy import training
@@ -103,9 +103,8 @@ def repair(
             "only PPO without a memory rehearses."
         )
     write = partial(_write, policies=policies, stage=entry.name, rehearsal=rehearsal)
-    base = Base(content.stages, write, "repair")
-    content = replace(content, stages=[entry], code=roles.code)
-    return begin(declared, content, options.training, reason, base, done)
+    content = replace(content, stages=[*content.stages, entry], code=roles.code)
+    return begin(declared, content, options.training, reason, write, done)
 
 
 def _go_on(declared: D, skill: str, after: str, options: RepairOptions) -> Trained[D]:

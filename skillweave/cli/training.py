@@ -12,7 +12,7 @@ from skillweave._internal.messages import shown_path
 from skillweave.api import Hierarchy, Run
 from skillweave.api.loading import declared_by
 from skillweave.cli import commands
-from skillweave.cli.output import print_line, print_result, run_words, save_score
+from skillweave.cli.output import Result, print_line, run_words, save_score
 from skillweave.cli.overrides import apply_overrides, parse_evolve
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.config import Evolution
@@ -22,7 +22,7 @@ from skillweave.training.options import Continuing, Starting
 from skillweave.workers.cluster import Ray
 
 
-def train(command: commands.Train) -> None:
+def train(command: commands.Train) -> Result:
     """Train a recipe, and perhaps the flat baseline after it."""
     fitted(Count, command.evaluate, "evaluate")
     if command.versus_flat and command.flat:
@@ -54,10 +54,10 @@ def train(command: commands.Train) -> None:
         result["flat"], more = _summary(command, flat)
         verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])
         lines = ["", "the flat agent:", *more, "", *verdict]
-    print_result(command, result, "\n".join(lines))
+    return result, "\n".join(lines)
 
 
-def resume(command: commands.Resume) -> None:
+def resume(command: commands.Resume) -> Result:
     """Finish a run that was stopped."""
     run = RunDirectory.open(command.run)
     declared = declared_by(run, command.recipe, to_train=True)
@@ -67,7 +67,7 @@ def resume(command: commands.Resume) -> None:
     except KeyboardInterrupt as error:
         raise _interrupted(error, command.ray) from None
     result, lines = _summary(command, trained)
-    print_result(command, result, "\n".join(lines))
+    return result, "\n".join(lines)
 
 
 def _trained(

@@ -43,6 +43,19 @@ class SavedEvaluation:
         return header | self.evaluation.to_json()
 
 
+def load_evaluations(run: RunDirectory) -> dict[str, SavedEvaluation]:
+    """Return the saved evaluations of a run, by the names that ``Run.info`` gives them.
+
+    Raises:
+        RunError: a file is damaged, or belongs to another run.
+    """
+    known = {
+        "evaluation": load_evaluation(run),
+        "evaluation_sampled": load_evaluation(run, deterministic=False),
+    }
+    return {name: saved for name, saved in known.items() if saved is not None}
+
+
 def save_evaluation(
     run: RunDirectory, evaluation: Evaluation, seed: int, deterministic: bool
 ) -> None:

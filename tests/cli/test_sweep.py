@@ -247,8 +247,13 @@ def test_what_goes_wrong_in_a_run_is_told_and_the_others_are_trained(
 
 
 def test_the_table_has_interquartile_means_intervals_and_medians(tmp_path):
-    some = [("a=1", seed, tmp_path, value) for seed, value in enumerate([1.0, 2.0, 3.0, 10.0])]
-    result, text = summary([*some, ("a=2", 0, tmp_path, 7.0), ("a=2", 1, tmp_path, "no")], tmp_path)
+    scores = {"a=1": [1.0, 2.0, 3.0, 10.0], "a=2": [7.0, "no"]}
+    jobs = [
+        (sweep.Job(settings, seed, tmp_path, False, 1), score)
+        for settings, row in scores.items()
+        for seed, score in enumerate(row)
+    ]
+    result, text = summary(jobs, tmp_path)
     first, second = result["groups"]
     assert (first["runs"], first["iqm"], first["median"]) == (4, 2.5, 2.5)
     assert (first["least"], first["most"]) == (1.0, 10.0)
