@@ -97,7 +97,7 @@ def from_hub(
         MissingExtra: the extra 'hub' is not installed.
     """
     check_declared(hierarchy)
-    return load_from(hub.download(hub.check_name(name), revision), hierarchy, ask=ASK_FROM_HUB)
+    return load_from(hub.download(name, revision), hierarchy, ask=ASK_FROM_HUB)
 
 
 def finish(declared: Hierarchy, content: Manifest, run_dir: Path) -> Run:

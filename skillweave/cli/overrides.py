@@ -76,15 +76,7 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
             raise _unknown(name, known)
     # Agents first that are set as a whole: others may have their settings.
     for owner in sorted(owners, key=lambda owner: () not in owners[owner]):
-        # All of a config's changes at once: some fit only together (num_envs, batch_size).
-        changes = owners[owner]
-        config = _config(declaration, owner)
-        if () in changes:
-            name, text = changes.pop(())
-            config = named_config(text, f"--set {name}={text}")
-        if not is_dataclass(config):
-            raise DeclarationError(_without_settings(next(iter(changes.values()))[0], owner))
-        _set_config(declaration, owner, replaced(config, changes))
+        _change(declaration, owner, owners[owner])
     if "steps" in names and declaration.steps:
         _set_total(declaration, declaration.steps, steps, list(filter(_PART.fullmatch, names)))
     declaration.__post_init__()
@@ -137,34 +129,37 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
     return values | (flat(declaration.selector, "selector.") if trained else {})
 
 
-def _config(declaration: Declaration, owner: tuple[str, ...]) -> Any:
-    """Return the settings that names starting with ``owner`` belong to."""
+def _change(declaration: Declaration, owner: tuple[str, ...], changes: Changes) -> None:
+    """Change settings that names starting with ``owner`` belong to.
+
+    All at once: some fit only together (num_envs, batch_size).
+    """
     head = owner[0]
+    holder: Any = declaration.train_defaults if head == "flat" else declaration
+    field = GROUPS.get(head, head)
     if head == "skills":
-        return declaration.skill(owner[1]).algorithm or declaration.algorithm
+        holder, field = declaration.skill(owner[1]), "algorithm"
+    config = getattr(holder, field)
+    if config is None and field in ("algorithm", "flat"):
+        config = declaration.algorithm
+    if () in changes:
+        name, text = changes.pop(())
+        config = named_config(text, f"--set {name}={text}")
+    if not is_dataclass(config):
+        name, _ = next(iter(changes.values()))
+        if head == "guide":
+            raise DeclarationError(
+                f"{name}: the hierarchy has no guide; declare one: guide=Guide(automaton)"
+            )
+        raise DeclarationError(
+            f"{name}: the selector is ready, so it has no settings; with --set selector=PPO it is "
+            "trained"
+        )
+    config = replaced(config, changes)
     if head == "flat":
-        return declaration.train_defaults.flat or declaration.algorithm
-    return getattr(declaration, GROUPS.get(head, head))
-
-
-def _set_config(declaration: Declaration, owner: tuple[str, ...], config: Any) -> None:
-    """Put settings into their place; the inverse of ``_config``."""
-    head = owner[0]
-    if head == "skills":
-        declaration.skill(owner[1]).algorithm = config
-    elif head == "flat":
-        declaration.train_defaults = replace(declaration.train_defaults, flat=config)
+        declaration.train_defaults = replace(holder, flat=config)
     else:
-        setattr(declaration, GROUPS.get(head, head), config)
-
-
-def _without_settings(name: str, owner: tuple[str, ...]) -> str:
-    if owner == ("guide",):
-        return f"{name}: the hierarchy has no guide; declare one: guide=Guide(automaton)"
-    return (
-        f"{name}: the selector is ready, so it has no settings; with --set selector=PPO it is "
-        "trained"
-    )
+        setattr(holder, field, config)
 
 
 def parse_evolve(

@@ -261,9 +261,14 @@ def _open(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Ten
             metadata = file.metadata() or {}
             names = file.keys() if with_tensors else ()
             tensors = {k: file.get_tensor(k) for k in names}
-    except (OSError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-        raise RunError(f"{path} is damaged (truncated?): {str(error)[:300]}") from error
-    except safetensors.SafetensorError as error:
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        RuntimeError,
+        safetensors.SafetensorError,
+    ) as error:
         raise RunError(f"{path} is damaged (truncated?): {str(error)[:300]}") from error
     if "skillweave" not in metadata:
         raise RunError(f"{path} was not written by Skillweave")
