@@ -932,8 +932,8 @@ def train_agent(options: AgentTraining) -> Run:
     Raises:
         DeclarationError: the algorithm cannot act in the environment; the message names others.
     """
-    targets = {k: getattr(options, k) for k in ("target_return", "target_success")}
-    agent = Agent(options.env, options.algorithm, options.steps, **targets)
+    targets = options.target_return, options.target_success
+    agent = Agent(options.env, options.algorithm, options.steps, *targets)
     with called_by("train_agent"):
         return run_of(train(agent, options))
 

@@ -314,17 +314,17 @@ def check_no_links(run: Path) -> None:
     Args:
         run: its directory, which may be reached through a link.
     """
-    for entry in _entries(run):
-        if entry.is_symlink():
-            if not _stays_in_tracker(run, Path(entry.path)):
+    for path in _entries(run):
+        if path.is_symlink():
+            if not _stays_in_tracker(run, path):
                 raise RunError(
-                    f"{entry.path} is a link to {_target(entry.path)}, and nothing is written into "
-                    "a run with links, because that would change files outside of it. Put a copy "
-                    "in its place, or delete it"
+                    f"{path} is a link to {path.readlink()}, and nothing is written into a run "
+                    "with links, because that would change files outside of it. Put a copy in its "
+                    "place, or delete it"
                 )
-        elif not entry.is_file() and not entry.is_dir():
+        elif not path.is_file() and not path.is_dir():
             raise RunError(
-                f"{entry.path} is a pipe or a device, and nothing is written into a run with such "
+                f"{path} is a pipe or a device, and nothing is written into a run with such "
                 "files. Delete it"
             )
 
@@ -348,19 +348,14 @@ def own_copy(path: Path) -> None:
             write_bytes(path, path.read_bytes(), make_directories=False)
 
 
-def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
+def _entries(folder: Path) -> Iterator[Path]:
     """Yield all entries below a folder; links are not followed."""
-    waiting = [str(folder)]
-    while waiting:
-        try:
-            with os.scandir(waiting.pop()) as scanned:
-                entries = sorted(scanned, key=lambda entry: entry.name)
-        except OSError as error:
-            raise RunError(f"could not read {error.filename}: {error.strerror}") from error
-        for entry in entries:
-            yield entry
-            if entry.is_dir(follow_symlinks=False):
-                waiting.append(entry.path)
+
+    def fail(error: OSError) -> None:
+        raise RunError(f"could not read {error.filename}: {error.strerror}") from error
+
+    for place, folders, files in os.walk(folder, onerror=fail):
+        yield from (Path(place, name) for name in sorted(folders + files))
 
 
 def _stays_in_tracker(run: Path, link: Path) -> bool:
@@ -369,10 +364,3 @@ def _stays_in_tracker(run: Path, link: Path) -> bool:
     if folder.name not in TRACKERS or folder == link:
         return False
     return link.resolve().is_relative_to(folder.resolve())
-
-
-def _target(link: str) -> str:
-    try:
-        return os.readlink(link)
-    except OSError:
-        return "another place"

@@ -126,11 +126,6 @@ def record_initial_policies(
     return started
 
 
-def same_shapes(one: Algorithm, other: Algorithm) -> bool:
-    """Return whether the weights of both have the same names and shapes."""
-    return one.weight_shapes() == other.weight_shapes()
-
-
 def copy_initial_policies(run: RunDirectory, learnt: Mapping[str, Learnt]) -> None:
     """Copy the initial policies of a new run's stages into it: all, or nothing.
 
@@ -171,7 +166,7 @@ def initial_policy(
         raise RunError(f"{path} does not hold the initial policy of {name!r}")
     check_unchanged(path, header, start.copy)
     policy = AgentPolicy.from_file(tensors, record_in(AgentHeader, header, path), str(path))
-    if not same_shapes(policy.algorithm, algorithm):
+    if policy.algorithm.weight_shapes() != algorithm.weight_shapes():
         raise RunError(f"{path} holds other networks than {name!r} has in this run")
     return policy, start.steps
 
