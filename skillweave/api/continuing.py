@@ -60,11 +60,7 @@ def prepared(
     if not run.finished or max(_more(run.manifest.stages, budgets).values()) > 0:
         run.begin(finished=True)
         run.manifest.code |= content.code  # as it goes on
-    try:
-        sentences += _grow(run, budgets)
-    except BaseException:
-        run.close()
-        raise
+    sentences += _grow(run, budgets)
     if run.finished and not any(entry.reached for entry in run.manifest.stages):
         more = "--set steps=N, or --scale" if from_command_line() else "more steps"
         sentences.append(

@@ -99,13 +99,12 @@ def begin(
     # An environment may change the working directory as it is made.
     given = options.run_dir
     place = absolute("." if given is None else as_path(given, "run_dir"))
-    recipe = content.recipe or declared.recipe
-    content = replace(content, recipe=recipe, **options.for_manifest())
+    content = replace(content, recipe=content.recipe or declared.recipe, **options.for_manifest())
     with _training(declared) as stack:
         roles = _plan(declared, content, options)
         if options.resume and (run := to_continue(place)) is not None:
-            declared, note = prepared(declared, content, run, options.evolve)
             stack.callback(run.close)
+            declared, note = prepared(declared, content, run, options.evolve)
             return go_on(declared, run, options, note)
         start_from = options.start_from
         if start_from is None and content.hierarchy is not None and declared._starts is not None:

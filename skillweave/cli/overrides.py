@@ -179,31 +179,29 @@ def parse_evolve(
         stages = declaration.plain_agent().stages()
     else:
         stages = apart_to_evolve(declaration)[0].stages()
-    names = [p.name for p in stages]
-    shared = list[tuple[str, str, str]]()
-    by_stage = {name: list[tuple[str, str, str]]() for name in names}
+    shared: Changes = {}
+    by_stage: dict[str, Changes] = {stage.name: {} for stage in stages}
     for setting in settings:
         name, text = _split(
             setting, f"--evolve {setting!r}: write name=value, such as population=8"
         )
-        head, _, rest = name.partition(".")
-        if head in names and rest:
-            by_stage[head].append((rest, name, text))
+        head, *rest = name.split(".")
+        if head in by_stage and rest:
+            by_stage[head][tuple(rest)] = name, text
         else:
-            shared.append((name, name, text))
+            shared[head, *rest] = name, text
     return {
-        name: _evolution([*shared, *by_stage[name]]) if shared or by_stage[name] else None
-        for name in names
+        stage: _evolution(shared | own) if shared or own else None
+        for stage, own in by_stage.items()
     }
 
 
-def _evolution(settings: list[tuple[str, str, str]]) -> Evolution:
-    """Return an evolution from dotted names, names as they were written, and values."""
+def _evolution(settings: Changes) -> Evolution:
+    """Return an evolution with these settings."""
     ranges: dict[str, Range] = {}
     changes: Changes = {}
     start = Evolution()
-    for name, written, text in settings:
-        path = tuple(name.split("."))
+    for path, (written, text) in settings.items():
         if path == ("selection",):
             if text.lower() not in SELECTIONS:
                 known = ", ".join(SELECTIONS)

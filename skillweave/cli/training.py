@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -62,10 +63,8 @@ def resume(command: commands.Resume) -> Result:
     run = RunDirectory.open(command.run)
     declared = declared_by(run, command.recipe, to_train=True)
     cluster = None if command.ray is None else Ray(address=command.ray or None)
-    try:
+    with _interruptible(command.ray):
         trained = declared.resume(command.run, **_options(command, Continuing), cluster=cluster)
-    except KeyboardInterrupt as error:
-        raise _interrupted(error, command.ray) from None
     result, lines = _summary(command, trained)
     return result, "\n".join(lines)
 
@@ -79,7 +78,7 @@ def _trained(
     baseline: bool = False,
 ) -> Run:
     """Train the hierarchy or its flat agent; a ``baseline`` starts with fresh weights."""
-    try:
+    with _interruptible(command.ray):
         cluster = None if command.ray is None else Ray(command.collectors, command.ray or None)
         return hierarchy.train(
             out,
@@ -92,8 +91,6 @@ def _trained(
             keep=command.keep,
             log_info=command.log_info or None,
         )
-    except KeyboardInterrupt as error:
-        raise _interrupted(error, command.ray) from None
 
 
 def _options(command: Any, *kinds: Any) -> dict[str, Any]:
@@ -166,8 +163,12 @@ def _summary(
     return result, lines
 
 
-def _interrupted(error: KeyboardInterrupt, ray: str | None) -> KeyboardInterrupt:
-    """Return the same interrupt, with ``--ray`` in the command that continues."""
-    if not str(error):
-        return KeyboardInterrupt("nothing was trained yet")
-    return KeyboardInterrupt(str(error) + ("" if ray is None else f" --ray {ray}".rstrip()))
+@contextmanager
+def _interruptible(ray: str | None) -> Iterator[None]:
+    """Train within the block; an interrupt names the command that continues, with ``--ray``."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        more = "" if ray is None else f" --ray {ray}".rstrip()
+        words = f"{error}{more}" if str(error) else "nothing was trained yet"
+        raise KeyboardInterrupt(words) from None

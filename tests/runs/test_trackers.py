@@ -121,19 +121,25 @@ def test_a_resumed_run_goes_on_in_the_same_run_of_wandb(
     assert first["resume"] == again["resume"] == "allow"
 
 
-def test_a_saved_evaluation_draws_what_each_skill_did(run: RunDirectory) -> None:
+@pytest.fixture
+def tracked(run: RunDirectory) -> RunDirectory:
+    """A finished run of 700 steps that TensorBoard shows."""
+    run.manifest.track = ("tensorboard",)
+    run.manifest.stages = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
+    return run
+
+
+def test_a_saved_evaluation_draws_what_each_skill_did(tracked: RunDirectory) -> None:
     from skillweave.training.evaluation import Evaluation
     from skillweave.training.evaluation_file import save_evaluation
     from skillweave.training.skill_report import SkillReport
 
     land = SkillReport(steps=30, calls=10, succeeded=4, ended={}, return_sum=None)
     hover = SkillReport(steps=10, calls=2, succeeded=None, ended={}, return_sum=None)
-    run.manifest.track = ("tensorboard",)
-    run.manifest.stages = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
     for returns in ((1.0, 1.0), (1.0, 2.0)):  # the later one takes the place of the first
         found = Evaluation(returns, (20, 20), None, {"land": land, "hover": hover})
-        save_evaluation(run, found, 0, True)
-    events = events_in(run.path / "tensorboard/evaluation")
+        save_evaluation(tracked, found, 0, True)
+    events = events_in(tracked.path / "tensorboard/evaluation")
     shown = {}
     for tag in events.Tags()["scalars"]:
         (point,) = events.Scalars(tag)
@@ -151,13 +157,11 @@ def gif(path: Path) -> Path:
     return path
 
 
-def test_tensorboard_shows_a_film(run: RunDirectory) -> None:
-    run.manifest.track = ("tensorboard",)
-    run.manifest.stages = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
-    film = gif(run.path / "hierarchy.gif")
-    track_film(run, film)
-    track_film(run, run.path / "other.mp4")  # it cannot show those, and says nothing
-    events = events_in(run.path / "tensorboard/film")
+def test_tensorboard_shows_a_film(tracked: RunDirectory) -> None:
+    film = gif(tracked.path / "hierarchy.gif")
+    track_film(tracked, film)
+    track_film(tracked, tracked.path / "other.mp4")  # it cannot show those, and says nothing
+    events = events_in(tracked.path / "tensorboard/film")
     assert events.Tags()["images"] == ["hierarchy"]
     (image,) = events.Images("hierarchy")
     assert (image.step, image.width, image.height) == (700, 3, 2)
