@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -240,6 +241,25 @@ def interrupt_at_checkpoint(monkeypatch: pytest.MonkeyPatch, number: int) -> Non
             raise KeyboardInterrupt
 
     monkeypatch.setattr(RunDirectory, "save_checkpoint", stop)
+
+
+@contextmanager
+def interrupted(number: int) -> Iterator[pytest.ExceptionInfo[KeyboardInterrupt]]:
+    """A block that trains, until Ctrl-C comes right after so many checkpoints."""
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt_at_checkpoint(patch, number)
+        with pytest.raises(KeyboardInterrupt) as stop:
+            yield stop
+
+
+def stop_at(steps: int, stage: str = "agent") -> Callable[[Any], None]:
+    """A callback that stops a training after so many steps of a stage."""
+
+    def stop(event: Any) -> None:
+        if event.stage == stage and event.steps >= steps:
+            raise Stopped
+
+    return stop
 
 
 Kinds = Mapping[str, Callable[[], Hierarchy]]

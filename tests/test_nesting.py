@@ -44,7 +44,6 @@ from skillweave.hierarchy.select_best import resolve_greedy
 from skillweave.planning.columns import ENDS
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.states import load_state
 from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.training.play import SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
@@ -298,7 +297,7 @@ def test_a_state_that_was_not_kept_is_not_gone_on_with(tmp_path):
     run = stopped_run(KINDS["then, inside and outside"](), tmp_path / "run", 20)
     like = SimpleNamespace()
     run.stage("inner/together").kept = Comparison("before")
-    assert load_state(run, "inner/right", like) is None
+    assert run.load_state("inner/right", like) is None
 
 
 def test_calls_are_logged_by_the_paths_of_who_acts(whole):

@@ -484,8 +484,8 @@ def restored_stages(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     found: set[str] = set()
     plain = RunDirectory.load_checkpoint
 
-    def noted(self: RunDirectory, kind: Any, stage: str, **how: Any) -> Any:
-        loaded = plain(self, kind, stage, **how)
+    def noted(self: RunDirectory, stage: str, like: Any) -> Any:
+        loaded = plain(self, stage, like)
         if loaded is not None:
             found.add(stage)
         return loaded

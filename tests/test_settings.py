@@ -130,6 +130,8 @@ PLACES = Kind(
 )
 SCALING = {"scale": NUMBERS, "offset": NUMBERS, "clip": RANGE}
 ALGORITHM = settings(sw.PPO(), sw.DQN())
+INFO_KEYS = Kind((5, "x", None, {"x": 1}, [5], [""], [None]), (["x"], ("x", "y"), []))
+ENV = Kind((5, True, None, [], {}, gym.Env()), ("CartPole-v1", sw.EnvSpec("CartPole-v1")))
 
 ON_POLICY = {
     "num_envs": AT_LEAST_ONE, "n_steps": AT_LEAST_ONE, "learning_rate": RATE, "gamma": FRACTION,
@@ -230,9 +232,9 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
     sw.TrainDefaults: {
         "eval_every": or_none(AT_LEAST_ONE), "eval_episodes": AT_LEAST_ONE,
         "checkpoint_every": AT_LEAST_ONE, "keep": word("last", "best"),
-        "log_info": Kind((5, "x", None, {"x": 1}, [5], [""], [None]), (["x"], ("x", "y"), [])),
+        "log_info": INFO_KEYS,
         "log_calls": or_none(AT_LEAST_ONE),
-        "log_calls_info": Kind((5, "x", None, {"x": 1}, [5], [""], [None]), (["x"], [])),
+        "log_calls_info": INFO_KEYS,
         "flat": or_none(ALGORITHM),
     },
     Range: {"low": ANY, "high": ANY, "scale": word("linear", "log")},
@@ -269,12 +271,12 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
         "check_seed": FLAG,
     },
     sw.Agent: {
-        "env": Kind((5, True, None, [], {}, gym.Env()), ("CartPole-v1", sw.EnvSpec("CartPole-v1"))),
+        "env": ENV,
         "algorithm": ALGORITHM, "steps": AT_LEAST_ONE, "target_return": or_none(ANY),
         "target_success": or_none(SHARE), "train_defaults": settings(sw.TrainDefaults()),
     },
     sw.Hierarchy: {
-        "env": Kind((5, True, None, [], {}, gym.Env()), ("CartPole-v1", sw.EnvSpec("CartPole-v1"))),
+        "env": ENV,
         "call_steps": or_none(Kind(AT_LEAST_ONE.refused, (*AT_LEAST_ONE.taken, sw.Lengths(1, 2)))),
         "steps": or_none(AT_LEAST_ONE), "learn": word("together", "apart", "apart, then together"),
         "algorithm": ALGORITHM, "selector": settings(sw.PPO(), np.sign),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -32,7 +31,7 @@ from skillweave.errors import RunError
 from skillweave.experience.acting import Acting
 from skillweave.hierarchy import training
 from skillweave.reporting.report.facts import settings
-from skillweave.runs import initial_policies
+from skillweave.runs import directory
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.runs.initial_policies import (
@@ -40,7 +39,6 @@ from skillweave.runs.initial_policies import (
     learners_of_run,
     record_initial_policies,
 )
-from skillweave.training import stage_log
 from skillweave.training.joint import JointLearner
 
 STILL = 1e-12
@@ -79,12 +77,21 @@ def declare(learn="apart", rate=None, skills=(Left, Other, Push), **how):
     return found
 
 
+def train(path, start, learn="apart", rate=None, seed=6, **how):
+    """Train the hierarchy in a new run that starts from others."""
+    return declare(learn, rate, **how).train(path, seed=seed, quiet=True, start_from=start)
+
+
 def weights_of(path):
     """By name, the weights of all who have learnt in a run, without the scaling of observations."""
     return {
         name: {k: v for k, v in own.policy.weights.items() if not k.startswith("obs_")}
         for name, own in learners_of_run(path).items()
     }
+
+
+def manifest_of(path):
+    return RunDirectory.open(path).manifest
 
 
 def assert_near(found, wanted):
@@ -123,8 +130,7 @@ def test_a_plain_agent_begins_with_the_weights_it_ended_with(kind, tmp_path):
 @pytest.mark.parametrize("learn", ["apart", "together", "apart, then together"])
 def test_all_who_have_learnt_there_begin_with_it(learn, source, tmp_path):
     path = tmp_path / "run"
-    how = {"together": Together(reference_kl=None, task_weight=0.0)}
-    declare(learn, STILL, **how).train(path, seed=6, quiet=True, start_from=source)
+    train(path, source, learn, STILL, together=Together(reference_kl=None, task_weight=0.0))
     before, after = weights_of(source), weights_of(path)
     assert set(before) == set(after) == {"left", "other", "selector"}
     for name, wanted in before.items():
@@ -135,16 +141,12 @@ def test_all_who_have_learnt_there_begin_with_it(learn, source, tmp_path):
 def test_what_was_learnt_together_is_a_start_too_with_its_critic(tmp_path):
     how = {"interrupt": True, "together_steps": 600}
     declare("together", **how).train(tmp_path / "a", seed=1, quiet=True)
-    declare("together", STILL, **how).train(
-        tmp_path / "b", seed=2, quiet=True, start_from=tmp_path / "a"
-    )
+    train(tmp_path / "b", tmp_path / "a", "together", STILL, seed=2, **how)
     before, after = weights_of(tmp_path / "a"), weights_of(tmp_path / "b")
     assert set(before) == {"left", "other", "selector", "skill_critic"}
     for name in ("left", "other", "selector"):
         assert_near(after[name], before[name])
-    assert (
-        "skill_critic" in json.loads((tmp_path / "b/run.json").read_text())["stages"][0]["starts"]
-    )
+    assert "skill_critic" in manifest_of(tmp_path / "b").stages[0].starts
 
 
 def test_who_has_not_learnt_there_begins_afresh_and_people_are_told(source, tmp_path, capsys):
@@ -168,7 +170,7 @@ def test_the_scaling_of_observations_counts_for_as_much_as_was_seen(source, tmp_
         k: v for k, v in learners_of_run(source)["left"].policy.weights.items() if "obs_" in k
     }
     assert set(moments) == {"obs_mean", "obs_var", "obs_low", "obs_high", "obs_count"}
-    run = declare().train(tmp_path / "run", seed=6, quiet=True, start_from=source)
+    run = train(tmp_path / "run", source)
     (told,) = [s["starts"] for s in run.info()["stages"] if s["name"] == "left"]
     assert told["left"]["steps"] == 320  # of the source's stage: ten rollouts
     config = PPO(num_envs=4, n_steps=16, network=SMALL, learning_rate=STILL)
@@ -221,26 +223,26 @@ def test_who_starts_from_a_run_is_not_held_near_what_it_was(source, tmp_path, mo
         make(self, parts, *more)
 
     monkeypatch.setattr(JointLearner, "__init__", made)
-    declare("together").train(tmp_path / "a", quiet=True, start_from=source)
+    train(tmp_path / "a", source, "together")
     assert set(anchors.values()) == {None}
     # What an earlier stage of the same run taught is an anchor, as ever.
-    declare("apart, then together").train(tmp_path / "b", quiet=True, start_from=source)
+    train(tmp_path / "b", source, "apart, then together")
     assert anchors["left"] is not None
 
 
 def test_where_nothing_can_be_copied_no_run_is_begun(source, tmp_path, monkeypatch):
-    write = initial_policies.write_tensors
+    write = directory.write_tensors
 
     def full(path, *about, **how):
         if "other" in path.name:
             raise RunError("No space left on device")
         return write(path, *about, **how)
 
-    monkeypatch.setattr(initial_policies, "write_tensors", full)
+    monkeypatch.setattr(directory, "write_tensors", full)
     with pytest.raises(SkillweaveError, match="No space left"):
-        declare().train(tmp_path / "run", quiet=True, start_from=source)
+        train(tmp_path / "run", source)
     monkeypatch.undo()
-    declare().train(tmp_path / "run", quiet=True, start_from=source)
+    train(tmp_path / "run", source)
 
 
 @pytest.mark.slow
@@ -250,16 +252,16 @@ def test_seeds_that_start_from_runs_of_their_own_are_one_group(tmp_path):
     for seed in range(2):
         first = agent.train(tmp_path / f"first-{seed}", seed=seed, quiet=True)
         run = agent.train(tmp_path / f"then-{seed}", seed=seed, quiet=True, start_from=first)
-        found.append(settings(RunDirectory.open(run.path).manifest))
+        found.append(settings(manifest_of(run.path)))
     assert found[0] == found[1]
-    assert found[0] != settings(RunDirectory.open(first.path).manifest)
+    assert found[0] != settings(manifest_of(first.path))
 
 
 @pytest.mark.slow
 def test_what_is_left_of_a_start_goes_with_the_next_training(source, tmp_path, monkeypatch):
     """Killed between the end of a stage and the removal of what it began with."""
     run = begun(tmp_path / "run", source)
-    monkeypatch.setattr(stage_log, "remove_initial_policies", lambda *_: 1 / 0)
+    monkeypatch.setattr(RunDirectory, "drop_used", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         training.train(declare(), run)
     run.close()
@@ -323,8 +325,8 @@ def test_runs_that_start_elsewhere_are_others(source, tmp_path):
     ids = [
         run.info()["id"]
         for run in (
-            declare().train(tmp_path / "a", quiet=True, start_from=source),
-            declare().train(tmp_path / "b", quiet=True),
+            train(tmp_path / "a", source),
+            train(tmp_path / "b", None),
         )
     ]
     assert ids[0] != ids[1]
@@ -364,7 +366,7 @@ def test_what_cannot_be_is_said_before_anything_is_written(case, source, tmp_pat
     if start == "nowhere":
         start = tmp_path / start
     with pytest.raises(SkillweaveError, match=says):
-        declare(**how).train(tmp_path / "run", quiet=True, start_from=start or source)
+        train(tmp_path / "run", start or source, **how)
     assert not (tmp_path / "run").exists()
 
 
@@ -389,7 +391,7 @@ def test_a_run_that_is_not_finished_gives_what_it_has(source, tmp_path):
         training.train(declare(), run, (heard,))
     run.close()
     assert set(learners_of_run(path)) == {"left"}
-    declare(rate=STILL).train(tmp_path / "run", quiet=True, start_from=path)
+    train(tmp_path / "run", path, rate=STILL)
     assert_near(weights_of(tmp_path / "run")["left"], weights_of(path)["left"])
 
 
@@ -408,20 +410,19 @@ def test_several_runs_are_a_start_by_the_name_of_who_begins(learn, source, other
     second, plain = other_runs
     start = {"other": second, "left": str(plain), "selector": source}
     how = {"together": Together(reference_kl=None, task_weight=0.0)}
-    declare(learn, STILL, **how).train(tmp_path / "run", seed=6, quiet=True, start_from=start)
+    train(tmp_path / "run", start, learn, STILL, **how)
     after = weights_of(tmp_path / "run")
     assert_near(after["other"], weights_of(second)["other"])
     assert_near(after["left"], weights_of(plain)["agent"])
     assert_near(after["selector"], weights_of(source)["selector"])
-    stages = json.loads((tmp_path / "run" / "run.json").read_text())["stages"]
-    runs = {k: v["run"] for stage in stages for k, v in stage.get("starts", {}).items()}
-    ids = [json.loads((p / "run.json").read_text())["id"] for p in (second, plain, source)]
-    assert runs == dict(zip(("other", "left", "selector"), ids, strict=True))
+    stages = manifest_of(tmp_path / "run").stages
+    runs = {name: start.run for stage in stages for name, start in stage.starts.items()}
+    places = {"other": second, "left": plain, "selector": source}
+    assert runs == {name: manifest_of(path).id for name, path in places.items()}
 
 
 def test_who_is_not_named_begins_afresh(source, tmp_path):
-    start = {"left": source}
-    declare(rate=STILL).train(tmp_path / "run", seed=6, quiet=True, start_from=start)
+    train(tmp_path / "run", {"left": source}, rate=STILL)
     after, before = weights_of(tmp_path / "run"), weights_of(source)
     assert_near(after["left"], before["left"])
     assert differ(after["selector"], before["selector"])
@@ -438,40 +439,46 @@ def test_what_is_wrong_with_several_runs_is_a_sentence(source, other_runs, tmp_p
         ({"selector": plain}, r"'selector' cannot start with what it learnt in .*plain"),
     ):
         with pytest.raises(SkillweaveError, match=says):
-            declare().train(tmp_path / "run", quiet=True, start_from=start)
-    declare(skills=(Left, Push)).train(tmp_path / "less", seed=1, quiet=True)
+            train(tmp_path / "run", start)
+    train(tmp_path / "less", None, skills=(Left, Push))
     with pytest.raises(RunError, match=r"'other' has not learnt in .*; there learnt left, s"):
-        declare().train(tmp_path / "run", quiet=True, start_from={"other": tmp_path / "less"})
+        train(tmp_path / "run", {"other": tmp_path / "less"})
 
 
-def test_the_command_takes_several_runs(source, other_runs, tmp_path, capsys):
+@pytest.fixture
+def train_from(tmp_path):
+    """The command that trains a run from others; it returns the exit code."""
     recipe = tmp_path / "cart.py"
     recipe.write_text("from test_start_from import declare\nhierarchy = declare(rate=1e-12)\n")
-    out = ["--out", str(tmp_path / "run"), "--evaluate", "0", "--quiet"]
-    both = ["--start-from", f"left={source}", "--start-from", f"other={other_runs[0]}"]
-    assert main(["train", str(recipe), *both, *out]) == 0
+
+    def command(*runs):
+        words = [word for run in runs for word in ("--start-from", str(run))]
+        return main(
+            ["train", str(recipe), "--out", str(tmp_path / "run"), "--evaluate", "0", *words]
+        )
+
+    return command
+
+
+def test_the_command_takes_several_runs(source, other_runs, tmp_path, capsys, train_from):
+    assert train_from(f"left={source}", f"other={other_runs[0]}") == 0
     after = weights_of(tmp_path / "run")
     assert_near(after["left"], weights_of(source)["left"])
     assert_near(after["other"], weights_of(other_runs[0])["other"])
-    again = ["--start-from", str(source), "--start-from", f"left={source}"]
-    assert main(["train", str(recipe), *again, *out]) == 1
+    assert train_from(source, f"left={source}") == 1
     assert "name the learner of each" in capsys.readouterr().err
-    twice = ["--start-from", f"left={source}", "--start-from", f"left={source}"]
-    assert main(["train", str(recipe), *twice, *out]) == 1
+    assert train_from(f"left={source}", f"left={source}") == 1
     assert "names left twice" in capsys.readouterr().err
 
 
-def test_the_command_takes_a_run(source, tmp_path, capsys):
-    recipe = tmp_path / "cart.py"
-    recipe.write_text("from test_start_from import declare\nhierarchy = declare(rate=1e-12)\n")
-    out = ["--out", str(tmp_path / "run"), "--evaluate", "1"]
-    assert main(["train", str(recipe), "--start-from", str(source), *out]) == 0
+def test_the_command_takes_a_run(source, tmp_path, capsys, train_from):
+    assert train_from(source) == 0
     assert "start from" in capsys.readouterr().err
     assert main(["info", str(tmp_path / "run")]) == 0
-    run = json.loads((source / "run.json").read_text())["id"]
+    run = manifest_of(source).id
     assert f"left starts from run {run}, after 320 steps there" in capsys.readouterr().out
     assert_near(weights_of(tmp_path / "run")["selector"], weights_of(source)["selector"])
-    assert main(["train", str(recipe), "--start-from", str(tmp_path / "no"), *out]) == 1
+    assert train_from(tmp_path / "no") == 1
     assert "holds no run" in capsys.readouterr().err
 
 

@@ -103,15 +103,6 @@ def global_generators(seeds: Seeds) -> Iterator[None]:
     Threads share them: while blocks of several threads overlap, the states from before the first
     block return after the last one.
     """
-    before = _enter_block()
-    seed_global_generators(seeds)
-    try:
-        yield
-    finally:
-        _leave_block(before)
-
-
-def _enter_block() -> dict[str, Any]:
     global _threads, _users
     with _lock:
         before = global_generators_state()
@@ -120,19 +111,16 @@ def _enter_block() -> dict[str, Any]:
                 _users = before
             _threads += 1
         _blocks.depth += 1
-    return before
-
-
-def _leave_block(before: dict[str, Any]) -> None:
-    global _threads
-    with _lock:
-        _blocks.depth -= 1
-        if _blocks.depth:
-            _set_states(before)
-            return
-        _threads -= 1
-        if not _threads:
-            _set_states(_users)
+    seed_global_generators(seeds)
+    try:
+        yield
+    finally:
+        with _lock:
+            _blocks.depth -= 1
+            if not _blocks.depth:
+                _threads -= 1
+            if _blocks.depth or not _threads:
+                _set_states(before if _blocks.depth else _users)
 
 
 def _set_states(states: dict[str, Any]) -> None:

@@ -64,7 +64,7 @@ from skillweave.hierarchy.weights import (
     write_agent,
     write_weights,
 )
-from skillweave.planning import CallLog, Planner
+from skillweave.planning import CallLog, Handover, Planner
 from skillweave.planning.forecast import Forecast, forecast
 from skillweave.planning.record import with_returns
 from skillweave.planning.run_log import handover_json, handover_of
@@ -83,20 +83,46 @@ from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.own_part import ZERO, part_from_json
 from skillweave.training.evaluation import Evaluation, evaluate
-from skillweave.training.evaluation_file import load_evaluation, save_evaluation
+from skillweave.training.evaluation_file import (
+    SavedEvaluation,
+    load_evaluations,
+    save_evaluation,
+)
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.types import Memory, Policy
 
 
-class Agent(PlainAgent):
-    """One plain agent that learns an environment's own reward: declared, trained and watched."""
+class Trainable:
+    """What hierarchies and plain agents have in common."""
 
-    def __repr__(self) -> str:
+    def __repr__(self: Any) -> str:
         return declared_line(self)
 
-    def _repr_html_(self) -> str:
-        """Return a table of the declaration, for notebooks."""
+    def _repr_html_(self: Any) -> str:
+        """Return tables of the declaration, for notebooks."""
         return declared_html(self)
+
+    @Takes(ResumeOptions)
+    def resume(self: Any, options: ResumeOptions) -> Run:
+        """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
+
+        The run's settings count, its steps too, and the code of this declaration: methods,
+        functions, conditions. A message lists settings that differ, except a population's. To train
+        for more steps: ``train(run_dir, resume=True)``.
+
+        Returns:
+            The finished run.
+        """
+        return run_of(resume(self, options))
+
+    @checked_names
+    def load(self: Any, run_dir: str | Path) -> Run:
+        """Load the finished run in ``run_dir``, of this declaration, or of its flat baseline."""
+        return run_of(load_policy(self, as_path(run_dir, "run_dir")))
+
+
+class Agent(Trainable, PlainAgent):
+    """One plain agent that learns an environment's own reward: declared, trained and watched."""
 
     @Takes(AgentOptions)
     def train(self, options: AgentOptions) -> Run:
@@ -115,20 +141,6 @@ class Agent(PlainAgent):
                 ``start_from``.
         """
         return run_of(train(self, options))
-
-    @Takes(ResumeOptions)
-    def resume(self, options: ResumeOptions) -> Run:
-        """Finish the run in ``run_dir``, as ``Hierarchy.resume`` does.
-
-        Returns:
-            The finished run.
-        """
-        return run_of(resume(self, options))
-
-    @checked_names
-    def load(self, run_dir: str | Path) -> Run:
-        """Load the finished run of this agent in ``run_dir``."""
-        return run_of(load_policy(self, as_path(run_dir, "run_dir")))
 
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Agent:
@@ -165,7 +177,7 @@ class Agent(PlainAgent):
         return Run(agent, path, read_agent(agent.spec, tensors, header, path))
 
 
-class Hierarchy(Declaration):
+class Hierarchy(Trainable, Declaration):
     """Skills, reflexes and a selector on one environment: declared, then trained and watched.
 
     ```python
@@ -180,13 +192,6 @@ class Hierarchy(Declaration):
     run = sw.Hierarchy("CartPole-v1", [Middle()]).train("runs/middle")
     ```
     """
-
-    def __repr__(self) -> str:
-        return declared_line(self)
-
-    def _repr_html_(self) -> str:
-        """Return tables of the declaration, for notebooks."""
-        return declared_html(self)
 
     @Takes(TrainOptions)
     def train(self, options: TrainOptions) -> Run:
@@ -206,24 +211,6 @@ class Hierarchy(Declaration):
                 ``start_from``.
         """
         return run_of(train(self, options))
-
-    @Takes(ResumeOptions)
-    def resume(self, options: ResumeOptions) -> Run:
-        """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
-
-        The run's settings count, its steps too, and the code of this hierarchy: methods, functions,
-        conditions. A message lists settings that differ, except a population's. To train for more
-        steps: ``train(run_dir, resume=True)``.
-
-        Returns:
-            The finished run.
-        """
-        return run_of(resume(self, options))
-
-    @checked_names
-    def load(self, run_dir: str | Path) -> Run:
-        """Load the finished run in ``run_dir``, of this hierarchy or of its flat baseline."""
-        return run_of(load_policy(self, as_path(run_dir, "run_dir")))
 
     def plain_agent(self, algorithm: AlgorithmConfig | None = None) -> Agent:
         """Return the flat baseline: one agent on the task itself, without skills and reflexes.
@@ -774,13 +761,7 @@ class Run(TrainedPolicy):
         counts of the log of calls, if there is one: see ``CallLog.handover``.
         """
         run = RunDirectory.open(self.path)
-        scores = {
-            "evaluation": load_evaluation(run),
-            "evaluation_sampled": load_evaluation(run, deterministic=False),
-        }
-        known = {k: v.to_json() for k, v in scores.items() if v is not None}
-        content: dict[str, Any] = as_json(run.manifest)
-        return content | known | handover_json(handover_of(run))
+        return info_json(run, load_evaluations(run), handover_of(run))
 
     @Takes(RepairOptions)
     def repair(self, options: RepairOptions) -> Run:
@@ -898,17 +879,20 @@ class PlannedRun(TrainedPolicy):
         )
 
 
-def declaration_of(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Agent:
-    """Return what a run trained: the hierarchy, or its flat baseline."""
-    if run.manifest.hierarchy is None and isinstance(declared, Hierarchy):
-        return declared.plain_agent()
-    return declared
+def info_json(
+    run: RunDirectory, saved: Mapping[str, SavedEvaluation], matrix: Handover | str | None
+) -> dict[str, Any]:
+    """Return a run's manifest, its saved evaluations and the counts of its log of calls."""
+    content: dict[str, Any] = as_json(run.manifest)
+    return content | {k: v.to_json() for k, v in saved.items()} | handover_json(matrix)
 
 
 def run_of(trained: Trained[Hierarchy | Agent]) -> Run:
     """Return what training or loading made as a ``Run``."""
     declared, run, policy = trained
-    return Run(declaration_of(declared, run), run.path, policy)
+    if run.manifest.hierarchy is None and isinstance(declared, Hierarchy):
+        declared = declared.plain_agent()  # the flat baseline
+    return Run(declared, run.path, policy)
 
 
 def _labels_of(
@@ -948,8 +932,8 @@ def train_agent(options: AgentTraining) -> Run:
     Raises:
         DeclarationError: the algorithm cannot act in the environment; the message names others.
     """
-    targets = {k: getattr(options, k) for k in ("target_return", "target_success")}
-    agent = Agent(options.env, options.algorithm, options.steps, **targets)
+    targets = options.target_return, options.target_success
+    agent = Agent(options.env, options.algorithm, options.steps, *targets)
     with called_by("train_agent"):
         return run_of(train(agent, options))
 

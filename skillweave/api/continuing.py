@@ -60,11 +60,7 @@ def prepared(
     if not run.finished or max(_more(run.manifest.stages, budgets).values()) > 0:
         run.begin(finished=True)
         run.manifest.code |= content.code  # as it goes on
-    try:
-        sentences += _grow(run, budgets)
-    except BaseException:
-        run.close()
-        raise
+    sentences += _grow(run, budgets)
     if run.finished and not any(entry.reached for entry in run.manifest.stages):
         more = "--set steps=N, or --scale" if from_command_line() else "more steps"
         sentences.append(
@@ -180,7 +176,7 @@ def _check_grows(run: RunDirectory, entry: StageEntry, more: int) -> None:
         )
     if not entry.done:
         return
-    if is_copy_of_hub(run.path) or not run.final_path(name).exists():
+    if is_copy_of_hub(run.path) or not run.file("final", name).exists():
         raise RunError(
             f"{run.path} cannot be given more steps: it does not hold the final state of stage "
             f"{name!r} (a copy from the hub does not, nor does a run whose disk was full). {new}"

@@ -53,7 +53,7 @@ def pull_run(name: str, path: str | Path, revision: str | None = None) -> Path:
     path = as_path(path, "path")
     if path.exists():
         raise RunError(f"{path} is there already; choose another folder")
-    copy = hub.download(hub.check_name(name), revision)
+    copy = hub.download(name, revision)
     manifest = hub.public(RunDirectory.open(copy).manifest)  # others may have pushed all of it
     # A name that cannot be guessed: a link that waits there would lead elsewhere.
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")

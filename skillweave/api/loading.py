@@ -56,7 +56,7 @@ def load_from(
     declared: Hierarchy | Agent | None = None,
     *,
     recipe: str | None = None,
-    ask: str,
+    ask: str = ASK,
 ) -> Run:
     """Load a finished run; errors are those of ``load``.
 
@@ -97,7 +97,7 @@ def from_hub(
         MissingExtra: the extra 'hub' is not installed.
     """
     check_declared(hierarchy)
-    return load_from(hub.download(hub.check_name(name), revision), hierarchy, ask=ASK_FROM_HUB)
+    return load_from(hub.download(name, revision), hierarchy, ask=ASK_FROM_HUB)
 
 
 def finish(declared: Hierarchy, content: Manifest, run_dir: Path) -> Run:

@@ -105,7 +105,7 @@ def load_policy(
         if folder.is_absolute() or name.count("/") != 1 or name.startswith("."):
             raise RunError(f"{folder} does not exist")
         try:
-            folder = hub.download_policy(hub.check_name(name), revision)
+            folder = hub.download(name, revision, policy=True)
         except RunError as error:
             raise RunError(
                 f"there is no folder {name}, and it cannot be loaded from the hub: {error}"

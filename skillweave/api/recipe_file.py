@@ -6,7 +6,9 @@ import ast
 import importlib.util
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib.machinery import PathFinder
+from importlib.util import resolve_name
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
@@ -137,7 +139,11 @@ def _beside(path: Path) -> dict[str, Path]:
     files: dict[str, Path] = {}
     due = [path]
     while due:
-        for name in _imported(due.pop()):
+        try:
+            names = {name.partition(".")[0] for name in imported(due.pop().read_bytes())}
+        except (SyntaxError, ValueError):
+            continue  # importing it raises the same error, with its line
+        for name in sorted(names):
             for file in (folder / name / "__init__.py", folder / f"{name}.py"):
                 if name not in files and name != "skillweave" and file.is_file():
                     files[name] = file.resolve()
@@ -145,17 +151,20 @@ def _beside(path: Path) -> dict[str, Path]:
     return files
 
 
-def _imported(file: Path) -> Iterator[str]:
-    """Yield the first parts of the names that a file imports, wherever in it."""
-    try:
-        tree = ast.parse(file.read_bytes())
-    except (SyntaxError, ValueError):
-        return  # importing it raises the same error, with its line
-    for node in ast.walk(tree):
+def imported(source: bytes, package: str = "") -> Iterator[str]:
+    """Yield the modules that a file of a package names, and the packages that they are in."""
+    for node in ast.walk(ast.parse(source)):
+        names: list[str] = []
         if isinstance(node, ast.Import):
-            yield from (alias.name.partition(".")[0] for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            yield node.module.partition(".")[0]
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = "." * node.level + (node.module or "")
+            with suppress(ImportError):  # `from . import x` in a file that is in no package
+                base = resolve_name(base, package)
+                names = [f"{base}.{alias.name}" for alias in node.names]
+        for name in names:
+            parts = name.split(".")
+            yield from (".".join(parts[: i + 1]) for i in range(len(parts)))
 
 
 def _file_of(module: ModuleType | None) -> Path | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,7 +12,7 @@ from skillweave._internal.paths import join, level_of, name_of
 from skillweave.algorithms.config import OnPolicy, config_to_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.applying import Trained, apply_manifest
-from skillweave.api.running import Base, begin, go_on
+from skillweave.api.running import begin, go_on
 from skillweave.api.train_options import RepairOptions
 from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy import training
@@ -34,7 +33,6 @@ from skillweave.runs.manifest import Manifest, RepairEntry, StageEntry
 from skillweave.skills.learnable import learn_on
 from skillweave.training.rehearsal import can_rehearse, save_rehearsal
 from skillweave.training.stage import check_stages
-from skillweave.types import Array
 
 D = TypeVar("D", bound=Declaration)
 
@@ -102,10 +100,16 @@ def repair(
             f" {skill!r} learns on without rehearsal, so it may forget what it does elsewhere: "
             "only PPO without a memory rehearses."
         )
-    write = partial(_write, policies=policies, stage=entry.name, rehearsal=rehearsal)
-    base = Base(content.stages, write, "repair")
-    content = replace(content, stages=[entry], code=roles.code)
-    return begin(declared, content, options.training, reason, base, done)
+
+    def write(run: RunDirectory) -> None:
+        """Write the policies of the stages that are done, and the observations of a rehearsal."""
+        for stage, by_name in policies.items():
+            run.save_policies(stage, by_name)
+        if rehearsal is not None:
+            save_rehearsal(run, entry.name, rehearsal)
+
+    content = replace(content, stages=[*content.stages, entry], code=roles.code)
+    return begin(declared, content, options.training, reason, write, done)
 
 
 def _go_on(declared: D, skill: str, after: str, options: RepairOptions) -> Trained[D]:
@@ -243,11 +247,3 @@ def _content(
             learnt = {name: parts[name] for name in entry.learns}
             policies[entry.name] = {k: p for k, p in learnt.items() if isinstance(p, AgentPolicy)}
     return replace(content, eval_every=None, keep="last"), policies
-
-
-def _write(run: RunDirectory, policies: Policies, stage: str, rehearsal: Array | None) -> None:
-    """Write the policies of the stages that are done, and the observations of a rehearsal."""
-    for name, by_name in policies.items():
-        run.save_policies(name, by_name)
-    if rehearsal is not None:
-        save_rehearsal(run, stage, rehearsal)

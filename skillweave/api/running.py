@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,7 +23,7 @@ from skillweave.api.starting import starts
 from skillweave.api.train_options import AgentOptions, Going, ResumeOptions, TrainOptions
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, Interrupted, RunError
-from skillweave.evolution.plan import Evolve, check_several, make_learner, plan
+from skillweave.evolution.plan import check_several, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.roles import Level, roles_of
@@ -34,7 +34,7 @@ from skillweave.runs.command_words import called_by, resume_words, saved_words
 from skillweave.runs.directory import First, RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.initial_policies import copy_initial_policies
-from skillweave.runs.manifest import Manifest, StageEntry, identity
+from skillweave.runs.manifest import Manifest, identity
 from skillweave.runs.numbered import make_numbered
 from skillweave.runs.trackers import Listener, make_trackers
 from skillweave.training.callback import TrainCallback
@@ -64,7 +64,7 @@ def train(declared: D, options: AgentOptions) -> Trained[D]:
     """Check everything, start a run, or continue the one that is there, and train it."""
     declared.validate()
     flat: bool | AlgorithmConfig = False
-    note = ""
+    note, evolve = "", options.evolve
     if isinstance(options, TrainOptions):
         flat = options.flat
         if flat is not False and options.log_calls is not None:
@@ -72,8 +72,9 @@ def train(declared: D, options: AgentOptions) -> Trained[D]:
                 "flat trains one plain agent, which has no skills to call: leave out log_calls"
             )
     how = declared.train_defaults.given(options)
-    if isinstance(declared, Declaration) and flat is False:
-        declared, note = evolving(declared, options.evolve)
+    by_stage = evolve if isinstance(evolve, Mapping) else {"": evolve}
+    if isinstance(declared, Declaration) and flat is False and any(by_stage.values()):
+        declared, note = apart_to_evolve(declared)
     content = training.manifest(declared, seed=options.seed, flat=flat, how=how)
     return begin(declared, content, options, note)
 
@@ -83,7 +84,7 @@ def begin(
     content: Manifest,
     options: AgentOptions,
     note: str = "",
-    base: Base | None = None,
+    repair: First | None = None,
     done: Mapping[str, Any] | None = None,
 ) -> Trained[D]:
     """Check everything, start a run, or continue the one that is there, and train it.
@@ -91,54 +92,37 @@ def begin(
     Args:
         content: the manifest of a new run, without options of this training alone.
         note: is printed first.
-        base: stages that are done, after which those of the manifest come.
+        repair: of a repair, the function that writes what its finished stages have learnt.
         done: as for ``training.train``.
     """
     _may_train()
     # An environment may change the working directory as it is made.
     given = options.run_dir
     place = absolute("." if given is None else as_path(given, "run_dir"))
-    recipe = content.recipe or declared.recipe
-    content = replace(content, recipe=recipe, **options.for_manifest())
-    with _surroundings(), called_by(declared._caller), ExitStack() as stack:
-        stack.enter_context(collected_notices())  # the progress prints them later
+    content = replace(content, recipe=content.recipe or declared.recipe, **options.for_manifest())
+    with _training(declared) as stack:
         roles = _plan(declared, content, options)
         if options.resume and (run := to_continue(place)) is not None:
-            declared, note = prepared(declared, content, run, options.evolve)
             stack.callback(run.close)
+            declared, note = prepared(declared, content, run, options.evolve)
             return go_on(declared, run, options, note)
         start_from = options.start_from
         if start_from is None and content.hierarchy is not None and declared._starts is not None:
             start_from = declared._starts()
-        learnt, origin = starts(content, start_from, roles)
-        first: First = partial(copy_initial_policies, learnt=learnt)
+        learnt, origin = starts(content, start_from, roles) if repair is None else ({}, "")
+        first = repair or partial(copy_initial_policies, learnt=learnt)
         note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))
         make_trackers(options.track, None)  # a missing extra is reported before anything is written
         if options.cluster is not None:
             options.cluster.check()
         if given is None:
-            stem = _run_name(declared, content) + ("" if base is None else f"-{base.name}")
+            stem = _run_name(declared, content) + ("" if repair is None else "-repair")
             place = make_numbered(stem, place)
             note = "; ".join(filter(None, (f"run: {shown_path(place)}", note)))
             stack.callback(_remove_if_empty, place)
-        if base is not None:
-            content.stages = [*base.stages, *content.stages]
-            first = base.write
         run = RunDirectory.create(place, content, first, hold=True, overwrite=options.overwrite)
         stack.callback(run.close)
         return go_on(declared, run, options, note, done)
-
-
-@dataclass(frozen=True)
-class Base:
-    """Finished stages with which a new run begins."""
-
-    stages: Sequence[StageEntry]
-    """Their entries."""
-    write: First
-    """Writes their policies into the run."""
-    name: str
-    """The word at the end of a numbered directory's name."""
 
 
 def _kept_by_populations(content: Manifest) -> str:
@@ -185,7 +169,8 @@ def begun(declared: Declaration, content: Manifest, run_dir: Path) -> RunDirecto
 @global_generators(Seeds(0) / "plan")  # environments are made, and timed
 def _plan(declared: Declared, content: Manifest, options: Going) -> Mapping[str, Role]:
     """Check everything, and complete the entries of a manifest's stages; return the roles."""
-    stages, spec, cluster = content.stages, declared.spec, options.cluster
+    stages = [stage for stage in content.stages if not stage.done]
+    spec, cluster = declared.spec, options.cluster
     declared.check_spaces()
     plan(stages, options.evolve)
     check_several(stages, spec)
@@ -216,10 +201,19 @@ def _plan(declared: Declared, content: Manifest, options: Going) -> Mapping[str,
 
 
 @contextmanager
-def _surroundings() -> Iterator[None]:
-    """Train with steady streams and normal tensors, whatever the user's program has set."""
-    with steady_streams(), normal_tensors():
-        yield
+def _training(declared: Declared) -> Iterator[ExitStack]:
+    """Train with steady streams and normal tensors, whatever the user's program has set.
+
+    Notices wait until the progress prints them.
+    """
+    with (
+        steady_streams(),
+        normal_tensors(),
+        called_by(declared._caller),
+        collected_notices(),
+        ExitStack() as stack,
+    ):
+        yield stack
 
 
 def _must_not_run_again(spec: EnvSpec) -> None:
@@ -253,11 +247,9 @@ def go_on(
     if not run.finished:
         _may_train()
     must_be_own(run.path)
-    with _surroundings(), ExitStack() as stack:
-        stack.enter_context(called_by(declared._caller))
+    with _training(declared) as stack, collected_notices() as notices:
         stack.callback(run.close)
         run.begin()
-        notices = stack.enter_context(collected_notices())
         progress = stack.enter_context(Progress(quiet=options.quiet))
         progress.plan(run.manifest.stages)
         if note:
@@ -282,19 +274,11 @@ def go_on(
 H = TypeVar("H", bound=Declaration)
 
 
-def evolving(declared: H, evolve: Evolve) -> tuple[H, str]:
-    """Return the hierarchy as it can evolve, and a sentence on differences from the declaration.
+def apart_to_evolve(declared: H) -> tuple[H, str]:
+    """Return a hierarchy as it can evolve, and a sentence on differences from the declaration.
 
     Skills and selector cannot evolve together, so where that is declared they learn apart.
     """
-    by_stage = evolve if isinstance(evolve, Mapping) else {"": evolve}
-    if all(evolution is None for evolution in by_stage.values()):
-        return declared, ""
-    return apart_to_evolve(declared)
-
-
-def apart_to_evolve(declared: H) -> tuple[H, str]:
-    """Return a copy of a hierarchy that learns apart, and a sentence about it."""
     roles = roles_of(declared)
     changed = [
         path

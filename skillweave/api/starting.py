@@ -24,7 +24,6 @@ from skillweave.runs.initial_policies import (
     learners_of_run,
     options_of,
     record_initial_policies,
-    same_shapes,
 )
 from skillweave.runs.manifest import Manifest, StageEntry
 from skillweave.runs.user_code import changes
@@ -242,8 +241,9 @@ def _check_start(role: Role, algorithm: Algorithm, content: Manifest, learnt: Le
     before, chooses = learnt.policy.algorithm, options_of(content, role.path)
     goal_space = None if role.skill is None else role.skill.goal_space
     kinds = [type(a.config).__name__ for a in (before, algorithm)]
+    there, here = before.weight_shapes(), algorithm.weight_shapes()
     what = ""
-    if before.weight_shapes().keys() != algorithm.weight_shapes().keys() and len(set(kinds)) > 1:
+    if there.keys() != here.keys() and len(set(kinds)) > 1:
         what = f"it learnt by {kinds[0]} there, and is to learn by {kinds[1]} here"
     elif learnt.chooses != chooses:
         what = (
@@ -257,16 +257,15 @@ def _check_start(role: Role, algorithm: Algorithm, content: Manifest, learnt: Le
         what = f"it {says}"
     elif not same_space(before.action_space, algorithm.action_space):
         what = "its actions are others here"
-    elif _networks(before) != _networks(algorithm) or not same_shapes(before, algorithm):
+    elif _networks(before) != _networks(algorithm) or there != here:
         what = "it has other networks here (network, critic, normalize_obs, or kinds of cells)"
     cannot = f"start_from: {role.path!r} cannot start with what it learnt in {learnt.where}: "
     if what:
         raise RunError(cannot + what)
-    here = content.by_path.get(role.path)
-    there = learnt.entry or here
+    entry = content.by_path.get(role.path)
     for field in ("sees", "acts", "residual"):
-        then, now = getattr(there, field, None), getattr(here, field, None)
-        if here is not None and then != now:
+        then, now = getattr(learnt.entry or entry, field, None), getattr(entry, field, None)
+        if entry is not None and then != now:
             raise RunError(
                 f"{cannot}there its {field} was {shown(then)}, and here it is "
                 f"{shown(now)}. Declare it as it was, or name the other learners alone, "

@@ -6,7 +6,7 @@ import ast
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import KW_ONLY, dataclass, fields
 from functools import cache, wraps
 from itertools import pairwise
 from pathlib import Path
@@ -89,9 +89,10 @@ class AgentOptions(Going, Reports, Starting):
     """A new directory; None: the next number of ``runs/<name>-<n>``, named after the recipe, the
     hierarchy or the environment. A run that has saved nothing yet is replaced, unless a process
     trains it; any other only with ``overwrite``."""
-    track: Sequence[str] = field(default=(), kw_only=True)
+    _: KW_ONLY
+    track: Sequence[str] = ()
     """Any of "tensorboard", "wandb" and "mlflow": one, or a list."""
-    start_from: StartFrom = field(default=None, kw_only=True)
+    start_from: StartFrom = None
     """Another run, or its directory: a learner that has learnt there, by the same name, starts with
     its policy. Or several runs, by learner: ``{"left": run, "right": other}``; a run of a plain
     agent fits any name. The policy is copied (of PPO and DQN all networks, of SAC and TD3 the
@@ -126,11 +127,11 @@ class AgentOptions(Going, Reports, Starting):
         return {name: getattr(self, name) for name in names}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainOptions(AgentOptions, CallReports):
     """Options of the training of a hierarchy."""
 
-    flat: bool | AlgorithmConfig = field(default=False, kw_only=True)
+    flat: bool | AlgorithmConfig = False
     """Train one plain agent for the same number of steps instead: the baseline. True: with the
     settings of ``train_defaults``; or its settings."""
 
@@ -147,13 +148,13 @@ class _Task:
     """Training budget in environment steps."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AgentTraining(AgentOptions, _Task):
     """Arguments of ``train_agent``."""
 
-    target_return: float | None = field(default=None, kw_only=True)
+    target_return: float | None = None
     """Stop early at this mean return of the periodic evaluation."""
-    target_success: float | None = field(default=None, kw_only=True)
+    target_success: float | None = None
     """Stop early at this share of episodes with a true ``info["success"]``, or
     ``info["is_success"]`` where that is missing."""
 
@@ -164,7 +165,8 @@ class _Pair:
 
     skill: str
     """The skill that fails, by its path."""
-    after: str = field(kw_only=True)
+    _: KW_ONLY
+    after: str
     """The skill after which it fails, of the same selector."""
 
 

@@ -16,7 +16,7 @@ from skillweave import recipes
 from skillweave._internal.messages import shown_path
 from skillweave.api import Hierarchy, Run
 from skillweave.cli import commands
-from skillweave.cli.output import print_line, print_result, save_score
+from skillweave.cli.output import Result, print_line, save_score
 from skillweave.errors import MissingExtra, RunError
 from skillweave.recipes import lander_missions as missions
 from skillweave.training.evaluation import Evaluation
@@ -161,7 +161,7 @@ def complete(score: Evaluation) -> float:
     return sum(one > COMPLETE for one in score.returns) / len(score.returns)
 
 
-def demo(command: commands.Demo) -> None:
+def demo(command: commands.Demo) -> Result:
     """Run the demonstration.
 
     Raises:
@@ -179,5 +179,4 @@ def demo(command: commands.Demo) -> None:
         f"That took {time.perf_counter() - started:.0f} s. Next: examples/key_door.py, your first "
         "own skills in 35 lines."
     )
-    if command.json:
-        print_result(command, shown.result, "")
+    return shown.result, None

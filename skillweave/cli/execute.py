@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,13 +13,13 @@ from typing import Any
 from skillweave import recipes
 from skillweave._internal.notices import notice
 from skillweave._internal.terminal import one_line, say
-from skillweave.api import Agent, Hierarchy, Run
+from skillweave.api import Agent, Hierarchy, Run, info_json
 from skillweave.api.hub import pull_run, push_run
-from skillweave.api.loading import ASK, declared_in, load_from
+from skillweave.api.loading import declared_in, load_from
 from skillweave.api.planning import lacking_features, mission_words
 from skillweave.cli import commands
 from skillweave.cli.demo import demo
-from skillweave.cli.output import print_result, run_words, save_score
+from skillweave.cli.output import Result, print_line, run_words, save_score
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.sweep import sweep
 from skillweave.cli.training import resume, train
@@ -37,22 +37,20 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import check_name, hub
 from skillweave.runs.manifest import Manifest
 from skillweave.runs.several import open_runs
-from skillweave.schema import as_json
-from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
+from skillweave.training.evaluation_file import SavedEvaluation, load_evaluations
 
 
 def run(command: commands.Output) -> int:
     """Carry a command out and print its result; return the exit code."""
-    return WAYS[type(command)](command) or 0
+    result, text = WAYS[type(command)](command)
+    if command.json:  # without any character that a terminal obeys
+        print_line(json.dumps(result, default=str).replace("\x7f", "\\u007f"))
+    elif text is not None:
+        print_line(text)
+    return 1 if result.get("failed") else 0  # runs of a sweep
 
 
-def _sweep(command: commands.Sweep) -> int:
-    result, text = sweep(command)
-    print_result(command, result, text)
-    return 1 if result["failed"] else 0
-
-
-def _evaluate(command: commands.Evaluate) -> None:
+def _evaluate(command: commands.Evaluate) -> Result:
     trained = _load_target(command)
     score = trained.evaluate(
         command.episodes,
@@ -68,7 +66,7 @@ def _evaluate(command: commands.Evaluate) -> None:
     result |= {} if command.goal is None else {"goal": _goal(command)}
     if command.skill is None and Path(command.target).is_dir() and not command.pretrained:
         save_score(trained, score, command.seed, command.deterministic)
-    print_result(command, result | score.to_json(), score.for_people())
+    return result | score.to_json(), score.for_people()
 
 
 def _goal(command: commands.Watched) -> Any:
@@ -82,7 +80,7 @@ def _goal(command: commands.Watched) -> Any:
         ) from error
 
 
-def _render(command: commands.Render) -> None:
+def _render(command: commands.Render) -> Result:
     trained = _load_target(command)
     path = command.out or Path(f"{Path(command.target).name.removesuffix('.safetensors')}.gif")
     result = trained.render(
@@ -95,10 +93,10 @@ def _render(command: commands.Render) -> None:
         quiet=command.quiet,
     )
     returns = ", ".join(f"{e['return']:.0f}" for e in result["episodes"])
-    print_result(command, result, f"{result['path']}: {result['frames']} frames, return {returns}")
+    return result, f"{result['path']}: {result['frames']} frames, return {returns}"
 
 
-def _log(command: commands.Log) -> None:
+def _log(command: commands.Log) -> Result:
     run = _load_with_code(command.run, command.recipe)
     if words := lacking_features(run.hierarchy, run.policy):
         notice(words)
@@ -115,10 +113,10 @@ def _log(command: commands.Log) -> None:
     result = {"run": str(command.run), "recorded": {"calls": len(log), "steps": log.steps}}
     result |= {"calls": len(calls), "steps": calls.steps} | handover_json(matrix)
     text = f"recorded {len(log):,} calls, {log.steps:,} steps; the run has {calls.steps:,} steps"
-    print_result(command, result, "\n".join([text, *_handover_lines(matrix)]))
+    return result, "\n".join([text, *_handover_lines(matrix)])
 
 
-def _plan(command: commands.Plan) -> None:
+def _plan(command: commands.Plan) -> Result:
     path = Path(command.target)
     if path.is_dir() and not command.pretrained:
         run = _load_with_code(path, command.recipe)
@@ -142,16 +140,15 @@ def _plan(command: commands.Plan) -> None:
         film = planned.render(command.film, seed=command.seed, quiet=command.quiet)
         result["film"] = film["path"]
         text += f"\n{film['path']}: {film['frames']} frames"
-    print_result(command, result, text)
+    return result, text
 
 
-def _plot(command: commands.Plot) -> None:
+def _plot(command: commands.Plot) -> Result:
     runs = open_runs(command.runs)
     of_several = (command.metric, command.agent, *command.label)
     if len(runs) == 1 and all(word is None for word in of_several) and command.band == "iqr":
         paths = [str(path) for path in plot_run(runs[0], command.out)]
-        print_result(command, {"paths": paths}, "\n".join(paths))
-        return
+        return {"paths": paths}, "\n".join(paths)
     figure = plot_curves(
         command.runs,
         command.out or "curves",
@@ -167,19 +164,16 @@ def _plot(command: commands.Plot) -> None:
         "metric": figure.metric,
         "lines": {line.label: line.seeds for line in figure.lines},
     }
-    print_result(command, result, "\n".join([*map(str, figure.paths), figure.caption]))
+    return result, "\n".join([*map(str, figure.paths), figure.caption])
 
 
-def _report(command: commands.Report) -> None:
+def _report(command: commands.Report) -> Result:
     run = RunDirectory.open(command.run)
     why_not = None
     trained = None
-    named = run.manifest.recipe
-    # A shipped recipe's code is trusted: with it, the skills' rewards and successes are known.
-    recipe = command.recipe or (named if named in recipes.names() else None)
     if run.finished:
         try:
-            trained = _load_run(command.run, recipe)
+            trained = load_from(command.run, recipe=command.recipe or _shipped(run))
         except SkillweaveError as error:
             if command.recipe is not None:
                 raise
@@ -196,21 +190,22 @@ def _report(command: commands.Report) -> None:
         deterministic=command.deterministic,
         quiet=command.quiet,
     )
-    _report_page(command, page)
+    return _about(page)
 
 
-def _compare(command: commands.Compare) -> None:
-    _report_page(command, write_comparison(open_runs(command.runs), command.out))
+def _compare(command: commands.Compare) -> Result:
+    return _about(write_comparison(open_runs(command.runs), command.out))
 
 
-def _report_page(command: commands.Output, page: dict[str, Any]) -> None:
+def _about(page: dict[str, Any]) -> Result:
+    """Return the result of a command that has written a page."""
     lines = [page["verdict"].replace("`", "")] if "verdict" in page else []
     lines += [f"{page['path']}: {page['bytes'] / 1e6:.1f} MB, written in {page['seconds']:.1f} s"]
     lines += [f"missing: {line}" for line in page["missing"]]
-    print_result(command, page, "\n".join(lines))
+    return page, "\n".join(lines)
 
 
-def _list(command: commands.List) -> None:
+def _list(command: commands.List) -> Result:
     shipped = []
     for name in recipes.names():
         weights = (recipes.source(name).with_suffix(".safetensors")).exists()
@@ -224,7 +219,7 @@ def _list(command: commands.List) -> None:
         lines.append("runs:")
         printable = [{k: one_line(v) for k, v in r.items()} for r in runs]
         lines += [f"  {r['path']:<30} {r['kind']} on {r['env']}: {r['status']}" for r in printable]
-    print_result(command, {"recipes": shipped, "runs": runs}, "\n".join(lines))
+    return {"recipes": shipped, "runs": runs}, "\n".join(lines)
 
 
 def _run_line(path: Path) -> dict[str, Any]:
@@ -238,21 +233,16 @@ def _run_line(path: Path) -> dict[str, Any]:
     }
 
 
-def _info(command: commands.Info) -> None:
+def _info(command: commands.Info) -> Result:
     if not (Path(command.target) / "run.json").exists() and not Path(command.target).is_dir():
         settings = list_settings(recipes.load(command.target))
         text = "\n".join(f"{k}={v}" for k, v in settings.items())
-        print_result(command, {"recipe": command.target, "settings": _plain(settings)}, text)
-        return
+        return {"recipe": command.target, "settings": settings}, text
     run = RunDirectory.open(command.target)
     manifest = run.manifest
-    saved = load_evaluation(run)
-    sampled = load_evaluation(run, deterministic=False)
-    scores = {} if saved is None else {"evaluation": saved.to_json()}
-    scores |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
-    matrix = handover_of(run)
-    lines = [*run_lines(manifest, [saved, sampled], command.target), *_handover_lines(matrix)]
-    print_result(command, as_json(manifest) | scores | handover_json(matrix), "\n".join(lines))
+    saved, matrix = load_evaluations(run), handover_of(run)
+    lines = [*run_lines(manifest, saved.values(), command.target), *_handover_lines(matrix)]
+    return info_json(run, saved, matrix), "\n".join(lines)
 
 
 def _handover_lines(matrix: Handover | str | None) -> list[str]:
@@ -266,9 +256,7 @@ def _handover_lines(matrix: Handover | str | None) -> list[str]:
     return [title, *(f"    {line}" for line in lines)]
 
 
-def run_lines(
-    manifest: Manifest, saved: Sequence[SavedEvaluation | None], target: object
-) -> list[str]:
+def run_lines(manifest: Manifest, saved: Iterable[SavedEvaluation], target: object) -> list[str]:
     """Return a run's manifest and its saved evaluations, as lines."""
     created, level = one_line(manifest.created), manifest.hierarchy
     lines = [f"{manifest.kind} on {one_line(manifest.env)}, seed {manifest.seed}, made {created}"]
@@ -314,45 +302,40 @@ def run_lines(
             lines.append(f"    {stage.kept}")
     lines += ["  " + ", ".join(one_line(f"{k} {v}") for k, v in manifest.versions.items())]
     for score in saved:
-        if score is not None:
-            how = "greedy" if score.deterministic else "sampled"
-            lines.append(f"  evaluated {one_line(score.made)}, seed {score.seed}, {how}:")
-            lines += [f"    {line}" for line in score.evaluation.for_people().splitlines()]
+        how = "greedy" if score.deterministic else "sampled"
+        lines.append(f"  evaluated {one_line(score.made)}, seed {score.seed}, {how}:")
+        lines += [f"    {line}" for line in score.evaluation.for_people().splitlines()]
     return lines
 
 
-def _plain(settings: dict[str, Any]) -> dict[str, Any]:
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}
-
-
-def _weights(command: commands.Weights) -> None:
-    trained = _load_run(command.run, command.recipe)
+def _weights(command: commands.Weights) -> Result:
+    trained = load_from(command.run, recipe=command.recipe)
     path = trained.save_weights(command.out)
-    print_result(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
+    return {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}"
 
 
-def _export(command: commands.Export) -> None:
+def _export(command: commands.Export) -> Result:
     if not command.onnx:
         raise DeclarationError("choose an export format: --onnx")
     name = Path(command.target).name.removesuffix(".safetensors")
     export = _load_target(command).export(command.out or Path(f"{name}-onnx"))
     result = {"path": str(export.path), "files": list(export.files), "code": export.code}
-    print_result(command, result, str(export))
+    return result, str(export)
 
 
-def _push(command: commands.Push) -> None:
+def _push(command: commands.Push) -> Result:
     _no_bars()
     pushed = push_run(command.run, command.name, command.private, command.calls)
     lines = [f"{pushed['url']}: {len(pushed['files'])} files", *pushed["missing"]]
     lines.append(f"load it: skillweave.from_hub({command.name!r})")
-    print_result(command, pushed, "\n".join(lines))
+    return pushed, "\n".join(lines)
 
 
-def _pull(command: commands.Pull) -> None:
+def _pull(command: commands.Pull) -> Result:
     _no_bars()
     name = PurePosixPath(check_name(command.name)).name
     path = pull_run(command.name, command.out or _free_path(Path("runs") / name), command.revision)
-    print_result(command, {"path": str(path)}, "\n".join(run_words(RunDirectory.open(path))))
+    return {"path": str(path)}, "\n".join(run_words(RunDirectory.open(path)))
 
 
 def _free_path(path: Path) -> Path:
@@ -371,7 +354,7 @@ def _no_bars() -> None:
     importlib.import_module("huggingface_hub.utils").disable_progress_bars()
 
 
-def _import_agilerl(command: commands.ImportAgilerl) -> None:
+def _import_agilerl(command: commands.ImportAgilerl) -> Result:
     if not command.trust:
         raise DeclarationError(
             f"{command.file} would be read as a pickle, and pickles can run code. This one is read "
@@ -381,7 +364,7 @@ def _import_agilerl(command: commands.ImportAgilerl) -> None:
     out = command.out or command.file.with_suffix(".safetensors")
     algo = convert(command.file, out)
     text = f"wrote {out}: a {algo} agent, for {algo}.load of skillweave.compat.agilerl"
-    print_result(command, {"path": str(out), "algorithm": algo}, text)
+    return {"path": str(out), "algorithm": algo}, text
 
 
 # Policies that commands name
@@ -397,7 +380,7 @@ def _load_target(command: commands.Watched | commands.Export | commands.Plan) ->
     if command.pretrained:
         return Hierarchy.pretrained(command.target)
     if path.is_dir():
-        return _load_run(path, command.recipe)
+        return load_from(path, recipe=command.recipe)
     if path.suffix == ".safetensors":
         header = open_weights(path)[1]
         named = None
@@ -417,8 +400,7 @@ def _load_with_code(path: Path, recipe: str | None) -> Run:
 
     Without it, what it means that a call succeeded is unknown, which a notice says.
     """
-    named = RunDirectory.open(path).manifest.recipe
-    run = _load_run(path, recipe or (named if named in recipes.names() else None))
+    run = load_from(path, recipe=recipe or _shipped(RunDirectory.open(path)))
     if isinstance(run.declaration, Hierarchy) and run.declaration.recorded:
         say(
             "the run is loaded without the code of its skills, so their success() is not known; "
@@ -427,16 +409,20 @@ def _load_with_code(path: Path, recipe: str | None) -> Run:
     return run
 
 
-def _load_run(path: Path, recipe: str | None) -> Run:
-    """Load the finished run at ``path``, with the code of a ``recipe`` if one is given."""
-    return load_from(path, recipe=recipe, ask=ASK)
+def _shipped(run: RunDirectory) -> str | None:
+    """Return a run's recipe if it is shipped, so that its code is trusted.
+
+    With it, the skills' rewards and successes are known.
+    """
+    named = run.manifest.recipe
+    return named if named in recipes.names() else None
 
 
-WAYS: dict[type, Callable[[Any], int | None]] = {
+WAYS: dict[type, Callable[[Any], Result]] = {
     commands.Demo: demo,
     commands.Train: train,
     commands.Resume: resume,
-    commands.Sweep: _sweep,
+    commands.Sweep: sweep,
     commands.Evaluate: _evaluate,
     commands.Render: _render,
     commands.Log: _log,

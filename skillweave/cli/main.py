@@ -43,10 +43,10 @@ def _main(arguments: Sequence[str] | None) -> int:
 
     tyro_arguments = ["--no-deterministic" if word == "--stochastic" else word for word in words]
     tyro_arguments = _with_addresses(tyro_arguments)
-    if (wrong := _unknown_command(words, [commands.name_of(c) for c in commands.COMMANDS])) != "":
+    parser: dict[str, Any] = {commands.name_of(c): c for c in commands.COMMANDS}
+    if wrong := _unknown_command(words, list(parser)):
         say(f"error: {wrong}")
         return 2
-    parser: dict[str, Any] = {commands.name_of(c): c for c in commands.COMMANDS}
     command: Any = tyro.extras.subcommand_cli_from_dict(
         parser,
         prog="skillweave",

@@ -1,29 +1,20 @@
-"""Print results for people or programs, and keep scores in their runs."""
+"""Results of commands, for people and for programs; scores are kept in their runs."""
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from skillweave._internal.messages import shown_path
 from skillweave._internal.terminal import put_result, say
 from skillweave.api import Run
-from skillweave.cli import commands
 from skillweave.errors import RunError
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation
 
-
-def print_result(command: commands.Output, data: dict[str, Any], text: str) -> None:
-    """Print JSON if ``--json`` is given, else the text."""
-    print_line(as_json(data) if command.json else text)
-
-
-def as_json(data: object) -> str:
-    """Return one line of JSON, without any character that a terminal obeys."""
-    return json.dumps(data, default=str).replace("\x7f", "\\u007f")
+Result = tuple[dict[str, Any], str | None]
+"""The result of a command for programs, and for people; None: they have seen it."""
 
 
 def print_line(text: str = "") -> None:

@@ -36,6 +36,8 @@ ALGORITHMS = ("algorithm", "selector", "flat")
 """First parts of the names of algorithms' settings."""
 
 
+Changes = dict[tuple[str, ...], tuple[str, str]]
+"""By the path of a field, the setting's full name and the text of its value."""
 SELECTIONS: dict[str, Any] = {"tournament": Tournament, "truncation": Truncation}
 
 
@@ -52,47 +54,40 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
     Raises:
         DeclarationError: no such setting (with a similar one), or a value out of range.
     """
-    configs: dict[tuple[str, ...], dict[str, str]] = {}
-    kinds: dict[tuple[str, ...], str] = {}
-    steps = declaration.steps
+    owners: dict[tuple[str, ...], Changes] = {}
+    names, steps = [], declaration.steps
     for setting in overrides:
-        name, sign, text = (part.strip() for part in setting.partition("="))
-        if not sign:
-            raise DeclarationError(
-                f"--set {setting!r}: write name=value, for example call_steps=20"
-            )
-        head, *rest = name.split(".")
+        name, text = _split(
+            setting, f"--set {setting!r}: write name=value, for example call_steps=20"
+        )
+        names.append(name)
+        head, *rest = path = name.split(".")
         if head in PLAIN and not rest:
             hint = annotations_of(Declaration)[head]
             setattr(declaration, head, _parse(name, text, hint))
         elif head == "skills" and len(rest) == 2 and rest[1] in OF_SKILLS:
             hint = annotations_of(Skill)[rest[1]]
             setattr(declaration.skill(rest[0]), rest[1], _parse(name, text, hint))
-        elif head == "skills" and len(rest) == 1:
-            kinds[head, rest[0]] = text
-        elif head == "skills" and len(rest) >= 2:
-            configs.setdefault((head, rest[0]), {})[name] = text
-        elif head in ALGORITHMS and not rest:
-            kinds[(head,)] = text
-        elif head in (*ALGORITHMS, *GROUPS) and rest:
-            configs.setdefault((head,), {})[name] = text
+        elif (head == "skills" and rest) or head in ALGORITHMS or (head in GROUPS and rest):
+            at = 2 if head == "skills" else 1
+            owners.setdefault(tuple(path[:at]), {})[tuple(path[at:])] = name, text
         else:
             known = [*list_settings(declaration), *(f"{c}." for c in (*ALGORITHMS, *GROUPS))]
             raise _unknown(name, known)
-    for owner in kinds | configs:
-        # All of a config's changes at once: some fit only together (num_envs, batch_size).
-        changes = configs.get(owner, {})
-        by_path = {tuple(n.split(".")[len(owner) :]): (n, text) for n, text in changes.items()}
-        config = _config(declaration, owner)
-        if owner in kinds:
-            config = named_config(kinds[owner], f"--set {'.'.join(owner)}={kinds[owner]}")
-        if not is_dataclass(config):
-            raise DeclarationError(_without_settings(next(iter(changes)), owner))
-        _set_config(declaration, owner, replaced(config, by_path))
-    names = [setting.partition("=")[0].strip() for setting in overrides]
+    # Agents first that are set as a whole: others may have their settings.
+    for owner in sorted(owners, key=lambda owner: () not in owners[owner]):
+        _change(declaration, owner, owners[owner])
     if "steps" in names and declaration.steps:
         _set_total(declaration, declaration.steps, steps, list(filter(_PART.fullmatch, names)))
     declaration.__post_init__()
+
+
+def _split(setting: str, wrong: str) -> tuple[str, str]:
+    """Return name and value of ``name=value``; raise a DeclarationError ``wrong`` without them."""
+    name, sign, text = (part.strip() for part in setting.partition("="))
+    if not sign:
+        raise DeclarationError(wrong)
+    return name, text
 
 
 def _set_total(
@@ -134,34 +129,37 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
     return values | (flat(declaration.selector, "selector.") if trained else {})
 
 
-def _config(declaration: Declaration, owner: tuple[str, ...]) -> Any:
-    """Return the settings that names starting with ``owner`` belong to."""
+def _change(declaration: Declaration, owner: tuple[str, ...], changes: Changes) -> None:
+    """Change settings that names starting with ``owner`` belong to.
+
+    All at once: some fit only together (num_envs, batch_size).
+    """
     head = owner[0]
+    holder: Any = declaration.train_defaults if head == "flat" else declaration
+    field = GROUPS.get(head, head)
     if head == "skills":
-        return declaration.skill(owner[1]).algorithm or declaration.algorithm
+        holder, field = declaration.skill(owner[1]), "algorithm"
+    config = getattr(holder, field)
+    if config is None and field in ("algorithm", "flat"):
+        config = declaration.algorithm
+    if () in changes:
+        name, text = changes.pop(())
+        config = named_config(text, f"--set {name}={text}")
+    if not is_dataclass(config):
+        name, _ = next(iter(changes.values()))
+        if head == "guide":
+            raise DeclarationError(
+                f"{name}: the hierarchy has no guide; declare one: guide=Guide(automaton)"
+            )
+        raise DeclarationError(
+            f"{name}: the selector is ready, so it has no settings; with --set selector=PPO it is "
+            "trained"
+        )
+    config = replaced(config, changes)
     if head == "flat":
-        return declaration.train_defaults.flat or declaration.algorithm
-    return getattr(declaration, GROUPS.get(head, head))
-
-
-def _set_config(declaration: Declaration, owner: tuple[str, ...], config: Any) -> None:
-    """Put settings into their place; the inverse of ``_config``."""
-    head = owner[0]
-    if head == "skills":
-        declaration.skill(owner[1]).algorithm = config
-    elif head == "flat":
-        declaration.train_defaults = replace(declaration.train_defaults, flat=config)
+        declaration.train_defaults = replace(holder, flat=config)
     else:
-        setattr(declaration, GROUPS.get(head, head), config)
-
-
-def _without_settings(name: str, owner: tuple[str, ...]) -> str:
-    if owner == ("guide",):
-        return f"{name}: the hierarchy has no guide; declare one: guide=Guide(automaton)"
-    return (
-        f"{name}: the selector is ready, so it has no settings; with --set selector=PPO it is "
-        "trained"
-    )
+        setattr(holder, field, config)
 
 
 def parse_evolve(
@@ -181,31 +179,29 @@ def parse_evolve(
         stages = declaration.plain_agent().stages()
     else:
         stages = apart_to_evolve(declaration)[0].stages()
-    names = [p.name for p in stages]
-    shared = list[tuple[str, str, str]]()
-    by_stage = {name: list[tuple[str, str, str]]() for name in names}
+    shared: Changes = {}
+    by_stage: dict[str, Changes] = {stage.name: {} for stage in stages}
     for setting in settings:
-        name, sign, text = (part.strip() for part in setting.partition("="))
-        if not sign:
-            raise DeclarationError(f"--evolve {setting!r}: write name=value, such as population=8")
-        head, _, rest = name.partition(".")
-        if head in names and rest:
-            by_stage[head].append((rest, name, text))
+        name, text = _split(
+            setting, f"--evolve {setting!r}: write name=value, such as population=8"
+        )
+        head, *rest = name.split(".")
+        if head in by_stage and rest:
+            by_stage[head][tuple(rest)] = name, text
         else:
-            shared.append((name, name, text))
+            shared[head, *rest] = name, text
     return {
-        name: _evolution([*shared, *by_stage[name]]) if shared or by_stage[name] else None
-        for name in names
+        stage: _evolution(shared | own) if shared or own else None
+        for stage, own in by_stage.items()
     }
 
 
-def _evolution(settings: list[tuple[str, str, str]]) -> Evolution:
-    """Return an evolution from dotted names, names as they were written, and values."""
+def _evolution(settings: Changes) -> Evolution:
+    """Return an evolution with these settings."""
     ranges: dict[str, Range] = {}
-    changes: dict[tuple[str, ...], tuple[str, str]] = {}
+    changes: Changes = {}
     start = Evolution()
-    for name, written, text in settings:
-        path = tuple(name.split("."))
+    for path, (written, text) in settings.items():
         if path == ("selection",):
             if text.lower() not in SELECTIONS:
                 known = ", ".join(SELECTIONS)
@@ -231,15 +227,12 @@ def _range(written: str, text: str) -> Range:
         ) from error
 
 
-def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> Any:
-    """Return ``config`` with the fields at these paths set to parsed values.
-
-    ``changes``: by path, the full name and the text of the value.
-    """
+def replaced(config: Any, changes: Changes) -> Any:
+    """Return ``config`` with the fields at these paths set to parsed values."""
     known = [f.name for f in fields(config)]
     hints = annotations_of(type(config))
     values: dict[str, Any] = {}
-    deeper: dict[str, dict[tuple[str, ...], tuple[str, str]]] = {}
+    deeper: dict[str, Changes] = {}
     for (field, *rest), (name, text) in changes.items():
         if field not in known:
             prefix = name.removesuffix(".".join([field, *rest]))
@@ -282,16 +275,13 @@ def _parse(name: str, text: str, hint: Any) -> Any:
             return float(value)
         if option is Linear and (linear := _LINEAR.fullmatch(text)):
             return Linear(*(_parse(name, part.strip(), float) for part in linear[1].split(",")))
-        if option is Lengths and isinstance(value, tuple | list):
-            return Lengths(*value)
-        if origin is Sequence and isinstance(value, str):
+        if isinstance(value, tuple | list) and (option is Lengths or origin in (Sequence, tuple)):
+            return Lengths(*value) if option is Lengths else tuple(value)
+        texts = origin is Sequence or (origin is tuple and typing.get_args(option)[0] is str)
+        if texts and isinstance(value, str):
             return tuple(part.strip() for part in value.split(","))
-        if origin is Sequence and isinstance(value, tuple | list):
-            return tuple(value)
-        if origin is tuple and isinstance(value, str) and typing.get_args(option)[0] is str:
-            return tuple(part.strip() for part in value.split(","))
-        if origin is tuple and isinstance(value, tuple | list | int):
-            return tuple(value) if isinstance(value, tuple | list) else (value,)
+        if origin is tuple and isinstance(value, int):
+            return (value,)
         if origin is typing.Literal and value in typing.get_args(option):
             return value
     expected = described(hint)

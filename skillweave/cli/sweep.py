@@ -6,7 +6,6 @@ the same command is given again, with the same code.
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import itertools
 import json
@@ -16,10 +15,8 @@ import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
-from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from importlib import metadata
-from importlib.util import resolve_name
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypedDict
@@ -31,8 +28,10 @@ from skillweave._internal.messages import error_text, short
 from skillweave._internal.terminal import say
 from skillweave.api import Hierarchy
 from skillweave.api.loading import finish
+from skillweave.api.recipe_file import imported
 from skillweave.api.running import begun
 from skillweave.cli import commands
+from skillweave.cli.output import Result
 from skillweave.cli.overrides import apply_overrides
 from skillweave.cli.processes import ProcessEnded, processes
 from skillweave.envs.make import cores
@@ -104,7 +103,7 @@ class Job:
         return training.manifest(hierarchy, seed=self.seed, flat=self.flat)
 
 
-def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
+def sweep(command: commands.Sweep) -> Result:
     """Train all runs of a sweep; return the results as JSON and for people."""
     fitted(AtLeastOne, command.evaluate, "evaluate")
     fitted(AtLeastOne | None, command.jobs, "jobs")
@@ -147,7 +146,7 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
         raise KeyboardInterrupt(
             f"{len(results)} of {len(jobs)} runs are finished; the same command continues"
         ) from None
-    return summary([(j.settings, j.seed, j.path, results[j]) for j in jobs], out)
+    return summary([(job, results[job]) for job in jobs], out)
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -273,23 +272,25 @@ def _task() -> Callable[..., Any]:
     return task
 
 
-Result = tuple[str, int, Path, float | str]
-"""Settings, seed, directory, and the mean return or an error."""
+def summary(results: Sequence[tuple[Job, float | str]], out: Path) -> Result:
+    """Return a sweep as JSON, and as a table with a line for each choice of settings.
 
-
-def summary(results: Sequence[Result], out: Path) -> tuple[dict[str, Any], str]:
-    """Return a sweep as JSON, and as a table with a line for each choice of settings."""
+    Args:
+        results: runs, each with its mean return or an error.
+        out: the sweep's directory.
+    """
     groups = list[dict[str, Any]]()
     failed = list[dict[str, str]]()
     runs = list[dict[str, Any]]()
-    for settings, rows in itertools.groupby(results, lambda result: result[0]):
+    for settings, rows in itertools.groupby(results, lambda result: result[0].settings):
         returns = []
-        for _, seed, path, score in rows:
+        for job, score in rows:
+            run = {"run": str(job.path)}
             if isinstance(score, str):
-                failed.append({"run": str(path), "error": score})
+                failed.append(run | {"error": score})
                 continue
             returns.append(score)
-            runs.append({"run": str(path), "settings": settings, "seed": seed, "return": score})
+            runs.append(run | {"settings": settings, "seed": job.seed, "return": score})
         group: dict[str, Any] = {"settings": settings or "as declared", "runs": len(returns)}
         if returns:
             over = over_seeds(np.array(returns))
@@ -299,7 +300,8 @@ def summary(results: Sequence[Result], out: Path) -> tuple[dict[str, Any], str]:
                 group |= {"low": float(over.low), "high": float(over.high)}
         groups.append(group)
     result = {"out": str(out), "groups": groups, "runs": runs, "failed": failed}
-    return result, "\n".join([*_table(groups), *_failures(failed), f"runs    {out}"])
+    failures = [f"failed  {f['run']}: {f['error']}" for f in failed]
+    return result, "\n".join([*_table(groups), *failures, f"runs    {out}"])
 
 
 def _table(groups: Sequence[dict[str, Any]]) -> list[str]:
@@ -314,10 +316,6 @@ def _table(groups: Sequence[dict[str, Any]]) -> list[str]:
             line += f" {g['least']:>9.1f} to {g['most']:.1f}".rjust(21)
         lines.append(line)
     return [*lines, "return: the interquartile mean over seeds of the runs' mean returns"]
-
-
-def _failures(failed: Sequence[dict[str, str]]) -> list[str]:
-    return [f"failed  {f['run']}: {f['error']}" for f in failed]
 
 
 MARK = ".sweep"
@@ -347,7 +345,7 @@ def must_be_same_code(out: Path, recipe: str) -> None:
     code = _checksum(code_files(recipes.file_of(recipe)))
     learnt = any(out.glob("*/checkpoint*")) or any(out.glob("*/policies/*"))
     if not learnt or not file.exists():
-        write_json(file, Mark(recipe=recipe, code=code), make_directories=False)
+        write_json(file, Mark(recipe=recipe, code=code))
         return
     mark: Mark = fit(Mark, read_json(file), str(file))
     if mark["code"] != code:
@@ -371,7 +369,7 @@ def code_files(recipe: Path) -> dict[str, Path]:
         file, package = due.pop()
         if file.suffix != ".py":  # compiled
             continue
-        for name in _imported(file.read_bytes(), package):
+        for name in imported(file.read_bytes(), package):
             module = sys.modules.get(name)
             if module is None or name in files or not _is_part(module):
                 continue
@@ -388,19 +386,3 @@ def _checksum(files: Mapping[str, Path]) -> str:
 
 def _is_part(module: ModuleType) -> bool:
     return is_own_code(module) or module.__name__.startswith("skillweave.recipes._")
-
-
-def _imported(source: bytes, package: str) -> Iterator[str]:
-    """Yield the modules that a file of a package names, and the packages that they are in."""
-    for node in ast.walk(ast.parse(source)):
-        names: list[str] = []
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = "." * node.level + (node.module or "")
-            with suppress(ImportError):  # `from . import x` in a file that is in no package
-                base = resolve_name(base, package)
-                names = [f"{base}.{alias.name}" for alias in node.names]
-        for name in names:
-            parts = name.split(".")
-            yield from (".".join(parts[: i + 1]) for i in range(len(parts)))

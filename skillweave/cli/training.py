@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from skillweave._internal.messages import shown_path
 from skillweave.api import Hierarchy, Run
 from skillweave.api.loading import declared_by
 from skillweave.cli import commands
-from skillweave.cli.output import print_line, print_result, run_words, save_score
+from skillweave.cli.output import Result, print_line, run_words, save_score
 from skillweave.cli.overrides import apply_overrides, parse_evolve
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.config import Evolution
@@ -22,7 +23,7 @@ from skillweave.training.options import Continuing, Starting
 from skillweave.workers.cluster import Ray
 
 
-def train(command: commands.Train) -> None:
+def train(command: commands.Train) -> Result:
     """Train a recipe, and perhaps the flat baseline after it."""
     fitted(Count, command.evaluate, "evaluate")
     if command.versus_flat and command.flat:
@@ -54,20 +55,18 @@ def train(command: commands.Train) -> None:
         result["flat"], more = _summary(command, flat)
         verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])
         lines = ["", "the flat agent:", *more, "", *verdict]
-    print_result(command, result, "\n".join(lines))
+    return result, "\n".join(lines)
 
 
-def resume(command: commands.Resume) -> None:
+def resume(command: commands.Resume) -> Result:
     """Finish a run that was stopped."""
     run = RunDirectory.open(command.run)
     declared = declared_by(run, command.recipe, to_train=True)
     cluster = None if command.ray is None else Ray(address=command.ray or None)
-    try:
+    with _interruptible(command.ray):
         trained = declared.resume(command.run, **_options(command, Continuing), cluster=cluster)
-    except KeyboardInterrupt as error:
-        raise _interrupted(error, command.ray) from None
     result, lines = _summary(command, trained)
-    print_result(command, result, "\n".join(lines))
+    return result, "\n".join(lines)
 
 
 def _trained(
@@ -79,7 +78,7 @@ def _trained(
     baseline: bool = False,
 ) -> Run:
     """Train the hierarchy or its flat agent; a ``baseline`` starts with fresh weights."""
-    try:
+    with _interruptible(command.ray):
         cluster = None if command.ray is None else Ray(command.collectors, command.ray or None)
         return hierarchy.train(
             out,
@@ -92,8 +91,6 @@ def _trained(
             keep=command.keep,
             log_info=command.log_info or None,
         )
-    except KeyboardInterrupt as error:
-        raise _interrupted(error, command.ray) from None
 
 
 def _options(command: Any, *kinds: Any) -> dict[str, Any]:
@@ -166,8 +163,12 @@ def _summary(
     return result, lines
 
 
-def _interrupted(error: KeyboardInterrupt, ray: str | None) -> KeyboardInterrupt:
-    """Return the same interrupt, with ``--ray`` in the command that continues."""
-    if not str(error):
-        return KeyboardInterrupt("nothing was trained yet")
-    return KeyboardInterrupt(str(error) + ("" if ray is None else f" --ray {ray}".rstrip()))
+@contextmanager
+def _interruptible(ray: str | None) -> Iterator[None]:
+    """Train within the block; an interrupt names the command that continues, with ``--ray``."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        more = "" if ray is None else f" --ray {ray}".rstrip()
+        words = f"{error}{more}" if str(error) else "nothing was trained yet"
+        raise KeyboardInterrupt(words) from None

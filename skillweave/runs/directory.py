@@ -26,7 +26,7 @@ import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, TypeVar
@@ -44,7 +44,6 @@ from skillweave.runs.files import (
     check_no_links,
     check_unchanged,
     make_directory,
-    read_signed,
     read_tensors,
     record_in,
     remove,
@@ -63,6 +62,7 @@ from skillweave.runs.manifest import (
     read_manifest,
     versions,
 )
+from skillweave.schema import as_json
 from skillweave.types import unprefixed
 
 S = TypeVar("S")
@@ -254,7 +254,7 @@ class RunDirectory:
     def save(self) -> None:
         """Write ``run.json``."""
         self.check()
-        write_json(self.path / "run.json", self.manifest, make_directories=False)
+        write_json(self.path / "run.json", self.manifest)
 
     def check(self) -> None:
         """Raise a RunError where the directory was deleted during the training."""
@@ -303,15 +303,13 @@ class RunDirectory:
         self, state: Any | None, header: Checkpoint, extra: Mapping[str, Tensor] | None = None
     ) -> None:
         """Write a stage's final state; arguments as in ``save_checkpoint``."""
-        self.check()
-        path = self.final_path(header.stage)
-        make_directory(path.parent)
-        write_tensors(path, *self._as_checkpoint(state, header, extra), make_directories=False)
+        stage = header.stage
+        self.write(FINAL, stage, *self._as_checkpoint(state, header, extra), stage)
 
     def _as_checkpoint(
         self, state: Any | None, header: Checkpoint, extra: Mapping[str, Tensor] | None
     ) -> tuple[dict[str, Tensor], Checkpoint]:
-        tensors = {} if state is None else {f.name: getattr(state, f.name) for f in fields(state)}
+        tensors = {} if state is None else dict(vars(state))
         tensors |= {f"extra.{k}": v for k, v in (extra or {}).items()}
         header = replace(header, run=self.manifest.id)
         self.record_lines(header)
@@ -325,13 +323,9 @@ class RunDirectory:
     def keep_final(self, stage: str) -> None:
         """Keep the latest checkpoint as the final state, from which the stage can continue."""
         self.check()
-        path = self.final_path(stage)
+        path = self.file(FINAL, stage)
         make_directory(path.parent)
         self._checkpoints.keep(path)
-
-    def final_path(self, stage: str) -> Path:
-        """Return the path of a stage's final state."""
-        return self.path / FINAL / f"{file_name(stage)}.safetensors"
 
     def make_room(self) -> bool:
         """Remove files that a run can spare on a full disk; return whether any existed.
@@ -345,17 +339,17 @@ class RunDirectory:
         return self._checkpoints.drop_previous() or bool(spare)
 
     def load_checkpoint(
-        self, kind: type[S] | None, stage: str, like: S | None = None
-    ) -> tuple[S | None, Checkpoint, dict[str, Tensor]] | None:
+        self, stage: str, like: Any
+    ) -> tuple[Any, Checkpoint, dict[str, Tensor]] | None:
         """Return state, header and extra of a stage's latest good checkpoint; None: it has none.
 
         Without a checkpoint, use the final state of a stage that continues, or whose budget is
         spent.
 
         Args:
-            kind: the type of the state, a dataclass of tensors; None: no state.
             stage: its name.
-            like: a state with the required shapes and types.
+            like: a state with the required shapes and types, a dataclass of tensors; None: no
+                state.
 
         Raises:
             RunError: checkpoints of this stage exist, but all are damaged.
@@ -370,19 +364,17 @@ class RunDirectory:
         tensors, header, path = checkpoint
         extra = unprefixed("extra", tensors)
         tensors = {k: v for k, v in tensors.items() if not k.startswith("extra.")}
-        names = set() if kind is None else {f.name for f in fields(kind)}  # type: ignore[arg-type]
-        if names != set(tensors):
+        if tensors.keys() != (set() if like is None else vars(like).keys()):
             raise RunError(
                 f"{path} has other fields than this version of Skillweave resumes from: finish the "
                 "run with the version that started it, or delete the file to train the stage again"
             )
-        if like is not None:
-            return state_from(tensors, like, str(path)), header, extra
-        return None if kind is None else kind(**tensors), header, extra
+        state = None if like is None else state_from(tensors, like, str(path))
+        return state, header, extra
 
     def _final(self, stage: str) -> tuple[dict[str, Tensor], Checkpoint, Path] | None:
         """Return tensors, header and file of a stage's final state; None: it has none."""
-        path = self.final_path(stage)
+        path = self.file(FINAL, stage)
         if not path.exists():
             return None
         tensors, found = read_tensors(path)
@@ -409,23 +401,86 @@ class RunDirectory:
 
     def save_policies(self, stage: str, policies: Mapping[str, AgentPolicy]) -> None:
         """Write the policies of a finished stage; ``save`` then binds the files to the run."""
-        self.check()
         entry = self.stage(stage)
         sums = {}
         for name, policy in policies.items():
-            tensors, header = policy.to_file()
-            path = self.policy_path(stage, name)
-            make_directory(path.parent)
-            header = replace(header, stage=stage, run=self.manifest.id)
-            sums[name] = write_tensors(path, tensors, header, make_directories=False)
+            file = _policy_name(stage, name)
+            sums[name] = self.write("policies", file, *policy.to_file(), stage)
         if list(sums) == [stage]:
             entry.sha256 = sums[stage]
         else:
             entry.policies = sums
 
-    def place(self, stage: str) -> dict[str, str]:
-        """Return the part of a file's header that names its stage and run."""
-        return {"stage": stage, "run": self.manifest.id}
+    def file(self, folder: str, name: str) -> Path:
+        """Return the path of the file of a stage or a learner in a folder of the run."""
+        return self.path / folder / f"{file_name(name)}.safetensors"
+
+    def write(
+        self, folder: str, name: str, tensors: Mapping[str, Tensor], header: Any, stage: str
+    ) -> str:
+        """Write the file of a stage or a learner, with stage and run in its header.
+
+        Args:
+            header: a dataclass, or a dict.
+            stage: its name.
+
+        Returns:
+            Its checksum.
+        """
+        self.check()
+        path = self.file(folder, name)
+        make_directory(path.parent)
+        header = as_json(header) | {"stage": stage, "run": self.manifest.id}
+        return write_tensors(path, tensors, header, make_directories=False)
+
+    def remove(self, folder: str, name: str) -> None:
+        """Remove the file of a stage or a learner, and its folder if that is empty then."""
+        path = self.file(folder, name)
+        remove(path)
+        with suppress(OSError):  # it still holds others, or never existed
+            path.parent.rmdir()
+
+    def learns_again(self, stage: str, name: str) -> bool:
+        """Return whether ``name`` also learns in a later stage."""
+        stages = self.manifest.stages
+        at = [entry.name for entry in stages].index(stage)
+        return any(name in entry.learns for entry in stages[at + 1 :])
+
+    def load_state(self, name: str, like: S) -> S | None:
+        """Return the final state of ``name`` in its latest stage; None: none to continue from.
+
+        A population writes none, and a stage whose result was not kept has none to continue from.
+
+        Args:
+            name: the learner.
+            like: a state with the required shapes and types, a dataclass of tensors.
+
+        Raises:
+            RunError: the file is damaged, or belongs to another learner or run.
+        """
+        path = self.file("states", name)
+        if not path.exists():
+            return None
+        tensors, header = read_tensors(path)
+        if header.get("learns") != name:
+            raise RunError(f"{path} does not hold the state of {name!r}")
+        self.must_be_ours(header.get("run"), path)
+        if self.stage(header.get("stage", "")).undone:
+            return None
+        return state_from(tensors, like, str(path))
+
+    def drop_used(self, entry: StageEntry) -> None:
+        """Remove the files of a finished stage that no later stage needs.
+
+        They are initial policies, the observations of a rehearsal, and final states of learners.
+        """
+        for name in entry.learns:
+            if not self.learns_again(entry.name, name):
+                self.remove("states", name)
+        for name in entry.starts:
+            self.remove("starts", name)
+        if entry.repair is not None and entry.repair.rehearsal is not None:
+            self.remove("starts", entry.name)
 
     def must_be_ours(self, run: str | None, path: Path) -> None:
         """Raise a RunError where ``run``, which a file's header names, is another run."""
@@ -451,20 +506,19 @@ class RunDirectory:
                 f"({saved_words(self)}). Continue it: {resume_words(self)}"
             )
         path = self.policy_path(stage, name)
-        tensors, header, sha256 = read_signed(path)
+        tensors, header = read_tensors(path)
         if header.get("kind") != "agent":
             raise RunError(f"{path} holds no agent's policy")
         of: AgentHeader = record_in(AgentHeader, header, path)
         if of.stage != stage:
             raise RunError(f"{path} holds the policy of stage {shown(of.stage)}")
         self.must_be_ours(of.run, path)
-        known = entry.policies.get(name or "", entry.sha256)
-        check_unchanged(path, sha256, known)
+        check_unchanged(path, header, entry.policies.get(name or "", entry.sha256))
         return AgentPolicy.from_file(tensors, of, str(path))
 
     def policy_path(self, stage: str, name: str | None = None) -> Path:
         """Return the path of a stage's policy, or of one of its learners."""
-        return self.path / "policies" / _policy_file(stage, name)
+        return self.file("policies", _policy_name(stage, name))
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to ``metrics.jsonl``."""
@@ -518,7 +572,7 @@ def _check_file_names(manifest: Manifest) -> None:
     """Raise a DeclarationError where the name of a policy's file would be too long."""
     for entry in manifest.stages:
         for name in (entry.name, *entry.learns):
-            file = _policy_file(entry.name, name)
+            file = f"{_policy_name(entry.name, name)}.safetensors"
             if len(file) + MORE > LONGEST_NAME:
                 raise DeclarationError(
                     f"the weights of {shown(name, 100)} would be in a file whose name has "
@@ -527,10 +581,9 @@ def _check_file_names(manifest: Manifest) -> None:
                 )
 
 
-def _policy_file(stage: str, name: str | None) -> str:
-    """Return the file name of a stage's policy, or of one of its learners."""
-    path = stage if name in (None, stage) else f"{stage}.{name}"
-    return f"{file_name(path)}.safetensors"
+def _policy_name(stage: str, name: str | None) -> str:
+    """Return the name of a stage's policy, or of one of its learners."""
+    return stage if name in (None, stage) else f"{stage}.{name}"
 
 
 def file_name(path: str) -> str:

@@ -12,6 +12,7 @@ import secrets
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import safetensors
@@ -123,15 +124,15 @@ def _sync(directory: Path) -> None:
             os.close(handle)
 
 
-def write_json(path: Path, data: Any, *, make_directories: bool = True) -> None:
+def write_json(path: Path, data: Any) -> None:
     """Replace a JSON file by a dataclass or a dict; add ``schema`` and a checksum."""
-    write_bytes(path, json_bytes(path, data), make_directories=make_directories)
+    write_bytes(path, json_bytes(path, data), make_directories=False)
 
 
 def json_bytes(path: Path, data: Any) -> bytes:
     """Return the bytes that ``write_json`` writes."""
     plain = _whole(json.loads(_json(path, {"schema": SCHEMA, **as_json(data)})))
-    text = _json(path, plain | {"sha256": _json_digest(plain)}, indent=2)
+    text = _json(path, plain | {"sha256": _digest(path, plain)}, indent=2)
     return text.encode() + b"\n"
 
 
@@ -169,15 +170,11 @@ def read_json(path: Path, convert: Callable[[dict[str, Any]], Any] | None = None
         raise RunError(f"{path} is damaged: not a JSON object")
     check_schema(data, path)
     found = data if convert is None else convert(data)
-    if data.pop("sha256", None) != _json_digest(data):
+    if data.pop("sha256", None) != _digest(path, data):
         raise RunError(
             f"{path} is damaged: its contents do not match its checksum (edited by hand?)"
         )
     return found
-
-
-def _json_digest(data: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
 def check_schema(data: Mapping[str, Any], where: Path | str) -> None:
@@ -207,7 +204,7 @@ def write_tensors(
     """
     plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
     whole = {"schema": SCHEMA, **as_json(header)}
-    whole["sha256"] = _digest(_json(path, whole, sort_keys=True), plain)
+    whole["sha256"] = _digest(path, whole, plain)
     # Only one key: safetensors writes several in random order, and equal runs need equal files.
     metadata = {"skillweave": _json(path, whole, sort_keys=True)}
     content = safetensors.torch.save(plain, metadata)
@@ -215,36 +212,29 @@ def write_tensors(
     return str(whole["sha256"])
 
 
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return tensors and header written by ``write_tensors``.
-
-    Raises:
-        RunError: missing, truncated, altered, no plain file, not Skillweave's, or of a
-            newer schema.
-    """
-    return read_signed(path)[:2]
-
-
 def record_in(kind: Any, header: Mapping[str, Any], path: Path | str) -> Any:
     """Return a file's content or header as a dataclass; a RunError names the wrong field."""
     return fit(kind, {k: v for k, v in header.items() if k not in ("schema", "sha256")}, str(path))
 
 
-def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
-    """Return tensors, header and checksum written by ``write_tensors``."""
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Return tensors and header, with its checksum ``sha256``, written by ``write_tensors``.
+
+    Raises:
+        RunError: missing, truncated, altered, no plain file, not Skillweave's, or of a
+            newer schema.
+    """
     header, tensors = _open(path, with_tensors=True)
-    recorded = header.pop("sha256", None)
-    sha256 = _digest(json.dumps(header, sort_keys=True), tensors)
-    if recorded != sha256:
+    if header.get("sha256") != _digest(path, header, tensors):
         raise RunError(f"{path} is damaged: its contents do not match its checksum")
     # Copies: in the file, tensors are aligned to 4 bytes only, and their matrix products differ in
     # the last bit, so a resumed run would drift.
-    return {k: v.clone() for k, v in tensors.items()}, header, sha256
+    return {k: v.clone() for k, v in tensors.items()}, header
 
 
-def check_unchanged(path: Path, actual: str, recorded: str | None) -> None:
+def check_unchanged(path: Path, header: Mapping[str, Any], recorded: str | None) -> None:
     """Raise a RunError where a file's checksum differs from the one that the run recorded."""
-    if actual != recorded:
+    if header["sha256"] != recorded:
         raise RunError(
             f"{path} is not the file that the run wrote there: its checksum differs. Restore the "
             "file, or train again"
@@ -271,9 +261,14 @@ def _open(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Ten
             metadata = file.metadata() or {}
             names = file.keys() if with_tensors else ()
             tensors = {k: file.get_tensor(k) for k in names}
-    except (OSError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-        raise RunError(f"{path} is damaged (truncated?): {str(error)[:300]}") from error
-    except safetensors.SafetensorError as error:
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        RuntimeError,
+        safetensors.SafetensorError,
+    ) as error:
         raise RunError(f"{path} is damaged (truncated?): {str(error)[:300]}") from error
     if "skillweave" not in metadata:
         raise RunError(f"{path} was not written by Skillweave")
@@ -291,8 +286,12 @@ def _json(path: Path, data: Mapping[str, Any], **options: Any) -> str:
         raise RunError(f"could not write {path}: {error}") from error
 
 
-def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
-    digest = hashlib.sha256(text.encode())
+def _digest(
+    path: Path, content: Mapping[str, Any], tensors: Mapping[str, Tensor] = MappingProxyType({})
+) -> str:
+    """Return the checksum of a file with this content and these tensors."""
+    plain = {k: v for k, v in content.items() if k != "sha256"}
+    digest = hashlib.sha256(_json(path, plain, sort_keys=True).encode())
     for name in sorted(tensors):
         digest.update(f"{name}{tensors[name].dtype}{tuple(tensors[name].shape)}".encode())
         flat = tensors[name].reshape(-1)
@@ -315,17 +314,17 @@ def check_no_links(run: Path) -> None:
     Args:
         run: its directory, which may be reached through a link.
     """
-    for entry in _entries(run):
-        if entry.is_symlink():
-            if not _stays_in_tracker(run, Path(entry.path)):
+    for path in _entries(run):
+        if path.is_symlink():
+            if not _stays_in_tracker(run, path):
                 raise RunError(
-                    f"{entry.path} is a link to {_target(entry.path)}, and nothing is written into "
-                    "a run with links, because that would change files outside of it. Put a copy "
-                    "in its place, or delete it"
+                    f"{path} is a link to {path.readlink()}, and nothing is written into a run "
+                    "with links, because that would change files outside of it. Put a copy in its "
+                    "place, or delete it"
                 )
-        elif not entry.is_file() and not entry.is_dir():
+        elif not path.is_file() and not path.is_dir():
             raise RunError(
-                f"{entry.path} is a pipe or a device, and nothing is written into a run with such "
+                f"{path} is a pipe or a device, and nothing is written into a run with such "
                 "files. Delete it"
             )
 
@@ -349,19 +348,14 @@ def own_copy(path: Path) -> None:
             write_bytes(path, path.read_bytes(), make_directories=False)
 
 
-def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
+def _entries(folder: Path) -> Iterator[Path]:
     """Yield all entries below a folder; links are not followed."""
-    waiting = [str(folder)]
-    while waiting:
-        try:
-            with os.scandir(waiting.pop()) as scanned:
-                entries = sorted(scanned, key=lambda entry: entry.name)
-        except OSError as error:
-            raise RunError(f"could not read {error.filename}: {error.strerror}") from error
-        for entry in entries:
-            yield entry
-            if entry.is_dir(follow_symlinks=False):
-                waiting.append(entry.path)
+
+    def fail(error: OSError) -> None:
+        raise RunError(f"could not read {error.filename}: {error.strerror}") from error
+
+    for place, folders, files in os.walk(folder, onerror=fail):
+        yield from (Path(place, name) for name in sorted(folders + files))
 
 
 def _stays_in_tracker(run: Path, link: Path) -> bool:
@@ -370,10 +364,3 @@ def _stays_in_tracker(run: Path, link: Path) -> bool:
     if folder.name not in TRACKERS or folder == link:
         return False
     return link.resolve().is_relative_to(folder.resolve())
-
-
-def _target(link: str) -> str:
-    try:
-        return os.readlink(link)
-    except OSError:
-        return "another place"

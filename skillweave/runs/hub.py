@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import importlib
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -225,7 +225,7 @@ def _copied_from(folder: Path) -> str | None:
     return None
 
 
-def download(name: str, revision: str | None = None) -> Path:
+def download(name: str, revision: str | None = None, *, policy: bool = False) -> Path:
     """Return the folder, in the cache of the hub's library, with a run's files.
 
     If the hub does not answer, use an earlier download.
@@ -233,30 +233,15 @@ def download(name: str, revision: str | None = None) -> Path:
     Args:
         name: ``owner/name``.
         revision: a branch, a tag or a commit; None: the latest.
+        policy: the files of a policy instead, ``policy.json`` and ONNX; others stay there.
 
     Raises:
         RunError: the run does not exist, it holds files that are not data, or the hub does not
             answer.
-        DeclarationError: ``revision`` is not a text.
+        DeclarationError: an argument is wrong.
         MissingExtra: the extra 'hub' is not installed.
     """
-    return _download(name, revision, WANTED, _check_kinds)
-
-
-def download_policy(name: str, revision: str | None = None) -> Path:
-    """Return the folder with a policy's ``policy.json`` and ONNX files; see ``download``.
-
-    Other files of the repository are not downloaded.
-    """
-    return _download(name, revision, OF_A_POLICY, _check_policy)
-
-
-def _download(
-    name: str,
-    revision: str | None,
-    wanted: Sequence[str],
-    check: Callable[[str, Sequence[str]], None],
-) -> Path:
+    check_name(name)
     api = hub_api()
     if revision is not None and not (isinstance(revision, str) and revision):
         raise DeclarationError(
@@ -264,11 +249,12 @@ def _download(
         )
     with hub_errors(api, name, revision=revision):
         info = _info(api, name, revision)
+        wanted = OF_A_POLICY if policy else WANTED
         options = {"revision": revision, "allow_patterns": list(wanted)}
         if isinstance(info, Exception):  # no answer
             path = _downloaded_before(api, name, options, info)
         else:
-            check(name, [file.rfilename for file in info.siblings or ()])
+            _check_files(name, [file.rfilename for file in info.siblings or ()], policy)
             path = Path(api.snapshot_download(name, **options))
             if path.name != info.sha:
                 raise RunError(f"{name} was changed while it was downloaded; try again")
@@ -293,14 +279,12 @@ def _downloaded_before(api: Any, name: str, options: Mapping[str, Any], error: E
         raise error from None
 
 
-def _check_policy(name: str, files: Sequence[str]) -> None:
-    """Raise a RunError where files are not those of a policy."""
-    if "policy.json" not in files:
+def _check_files(name: str, files: Sequence[str], policy: bool) -> None:
+    """Raise a RunError where files are not those of a policy; or of a run, and only data."""
+    if policy and "policy.json" not in files:
         raise RunError(f"{name} holds no policy of Skillweave: it has no policy.json")
-
-
-def _check_kinds(name: str, files: Sequence[str]) -> None:
-    """Raise a RunError where files are not data, or are not a run."""
+    if policy:
+        return
     if others := _refused(files):
         raise RunError(
             f"{name} holds {others}, and a run on the hub is data alone ({', '.join(KINDS)}): "

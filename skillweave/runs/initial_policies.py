@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,11 +20,9 @@ from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import (
     check_unchanged,
     make_directory,
-    read_signed,
+    read_tensors,
     record_in,
-    remove,
     write_bytes,
-    write_tensors,
 )
 from skillweave.runs.manifest import Manifest, SkillEntry, StageEntry, Start
 from skillweave.skills.foreign_policy import Foreign, as_recorded
@@ -129,11 +126,6 @@ def record_initial_policies(
     return started
 
 
-def same_shapes(one: Algorithm, other: Algorithm) -> bool:
-    """Return whether the weights of both have the same names and shapes."""
-    return one.weight_shapes() == other.weight_shapes()
-
-
 def copy_initial_policies(run: RunDirectory, learnt: Mapping[str, Learnt]) -> None:
     """Copy the initial policies of a new run's stages into it: all, or nothing.
 
@@ -143,10 +135,8 @@ def copy_initial_policies(run: RunDirectory, learnt: Mapping[str, Learnt]) -> No
         for entry in run.manifest.stages:
             for name, start in entry.starts.items():
                 tensors, header = learnt[name].policy.to_file()
-                path = _path(run, name)
-                make_directory(path.parent)
-                header = replace(header, starts=name, stage=entry.name, run=run.manifest.id)
-                start.copy = write_tensors(path, tensors, header, make_directories=False)
+                header = replace(header, starts=name)
+                start.copy = run.write("starts", name, tensors, header, entry.name)
     except BaseException:
         shutil.rmtree(run.path / "starts", ignore_errors=True)
         raise
@@ -165,32 +155,20 @@ def initial_policy(
     start = run.stage(stage).starts.get(name)
     if start is None:
         return None
-    path = _path(run, name)
+    path = run.file("starts", name)
     if not path.exists():
         raise RunError(
             f"{path} is missing: {name!r} needs it to begin. Restore the file, or train again"
         )
-    tensors, header, sha256 = read_signed(path)
+    tensors, header = read_tensors(path)
     run.must_be_ours(header.get("run"), path)
     if header.get("kind") != "agent" or header.get("starts") != name:
         raise RunError(f"{path} does not hold the initial policy of {name!r}")
-    check_unchanged(path, sha256, start.copy)
+    check_unchanged(path, header, start.copy)
     policy = AgentPolicy.from_file(tensors, record_in(AgentHeader, header, path), str(path))
-    if not same_shapes(policy.algorithm, algorithm):
+    if policy.algorithm.weight_shapes() != algorithm.weight_shapes():
         raise RunError(f"{path} holds other networks than {name!r} has in this run")
     return policy, start.steps
-
-
-def remove_initial_policies(run: RunDirectory, stage: str) -> None:
-    """Remove the initial policies of the learners of a finished stage."""
-    for name in run.stage(stage).starts:
-        remove(_path(run, name))
-    with suppress(OSError):  # it still holds others, or never existed
-        (run.path / "starts").rmdir()
-
-
-def _path(run: RunDirectory, name: str) -> Path:
-    return run.path / "starts" / f"{file_name(name)}.safetensors"
 
 
 def copy_ready_policy(run: RunDirectory, skill: str, policy: Policy) -> None:

@@ -20,13 +20,11 @@ class JsonLines:
 
     Args:
         path: the file.
-        schema: the schema of each line (see ``schema.fit``); None: any object.
+        schema: the schema of each line (see ``schema.fit``).
         next_step: returns the command to type when a full disk has space again, for messages.
     """
 
-    def __init__(
-        self, path: Path, schema: Any = None, next_step: Callable[[], str] | None = None
-    ) -> None:
+    def __init__(self, path: Path, schema: Any, next_step: Callable[[], str]) -> None:
         self.path = path
         self._schema = schema
         self._next_step = next_step
@@ -54,11 +52,8 @@ class JsonLines:
             self.close()  # a line that failed must not be written later
             raise RunError(
                 f"could not write {self.path}: {error.strerror}. The checkpoint is intact; free "
-                f"space{self._next()}"
+                f"space, then: {self._next_step()}"
             ) from error
-
-    def _next(self) -> str:
-        return "" if self._next_step is None else f", then: {self._next_step()}"
 
     def rewind(self, size: int | None) -> None:
         """Truncate to ``size`` bytes, because training writes the rest again; None: do nothing.
@@ -97,8 +92,7 @@ class JsonLines:
                     raise RunError(
                         f"{self.path} is damaged in line {number}: {shown(record)} is no object"
                     )
-                where = f"{self.path}, line {number}"
-                yield record if self._schema is None else fit(self._schema, record, where)
+                yield fit(self._schema, record, f"{self.path}, line {number}")
 
     def close(self) -> None:
         """Close the file; the next line opens it again."""

@@ -35,29 +35,32 @@ class Lock:
         self._directory = directory
         self._wait = wait
         self._path = directory / name
-        self.exclusive = False
-        """True if the system excludes other processes."""
-        self._open()
-        self._lock()
+        self._acquire()
         if self.exclusive and os.fstat(self._handle).st_nlink > 1:
             # The run was copied by hard links (cp -al): the copy gets a separate lock.
             with suppress(FileNotFoundError):
                 os.unlink(self._path)
             self.release()
-            self._open()
-            self._lock()
+            self._acquire()
         if self.exclusive:
             with suppress(OSError):  # the text is only for messages
                 os.ftruncate(self._handle, 0)
                 os.write(self._handle, f"{os.getpid()} {platform.node()}\n".encode())
 
-    def _lock(self) -> None:
-        """Lock the open file, if the system supports it.
+    def _acquire(self) -> None:
+        """Open the file, or create it, and lock it, if the system supports it.
 
         Raises:
-            RunError: another process has locked it.
+            RunError: it cannot be opened, or another process has locked it.
         """
         self.exclusive = False
+        """True if the system excludes other processes."""
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+        try:
+            self._handle = os.open(self._path, flags, 0o666)
+        except OSError as error:
+            raise RunError(f"could not write {self._path}: {error.strerror}") from error
+        _held.add(self._handle)
         if fcntl is None:
             return
         try:
@@ -71,15 +74,6 @@ class Lock:
         except OSError:  # a file system without locks
             return
         self.exclusive = True
-
-    def _open(self) -> None:
-        """Open the file, or create it."""
-        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-        try:
-            self._handle = os.open(self._path, flags, 0o666)
-        except OSError as error:
-            raise RunError(f"could not write {self._path}: {error.strerror}") from error
-        _held.add(self._handle)
 
     def _owner(self) -> str:
         """Return the process that holds the lock, as far as the file names it."""

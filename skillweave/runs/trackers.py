@@ -164,8 +164,14 @@ class MLflow(Tracker):
         self._since = time.monotonic()
         try:
             self._client: Any = mlflow.MlflowClient()
+            known = self._client.get_experiment_by_name(MLFLOW_EXPERIMENT)
+            experiment = (
+                self._client.create_experiment(MLFLOW_EXPERIMENT)
+                if known is None
+                else known.experiment_id
+            )
             tag = identifier(run)
-            mlflow_run = self._existing(tag) or self._new(tag)
+            mlflow_run = self._existing(experiment, tag) or self._new(experiment, tag)
         except Exception as error:  # of any store
             raise RunError(
                 f"MLflow at {mlflow.get_tracking_uri()} does not answer: {error_text(error)}. Set "
@@ -175,25 +181,20 @@ class MLflow(Tracker):
         stages = [stage.name for stage in run.manifest.stages]
         self._sent_steps = {s: mlflow_run.data.metrics.get(f"{s}/steps", -1.0) for s in stages}
 
-    def _existing(self, tag: str) -> Any:
+    def _existing(self, experiment: str, tag: str) -> Any:
         """Return MLflow's run of an earlier part of this run; None: it has none."""
-        experiment = self._client.get_experiment_by_name(MLFLOW_EXPERIMENT)
-        if experiment is None:
-            self._client.create_experiment(MLFLOW_EXPERIMENT)
-            return None
         query = f"tags.`{MLFLOW_TAG}` = '{tag}'"
-        runs = self._client.search_runs([experiment.experiment_id], query, max_results=1)
+        runs = self._client.search_runs([experiment], query, max_results=1)
         if not runs:
             return None
         self._client.update_run(runs[0].info.run_id, status="RUNNING")
         return runs[0]
 
-    def _new(self, tag: str) -> Any:
+    def _new(self, experiment: str, tag: str) -> Any:
         """Create MLflow's run, with the settings."""
-        experiment = self._client.get_experiment_by_name(MLFLOW_EXPERIMENT)
         manifest = self._run.manifest
         created = self._client.create_run(
-            experiment.experiment_id,
+            experiment,
             tags={MLFLOW_TAG: tag},
             run_name=self._run.path.resolve().name,
         )

@@ -27,7 +27,6 @@ from skillweave.ops.device import resolve_device
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.initial_policies import initial_policy
 from skillweave.runs.manifest import StageEntry
-from skillweave.runs.states import load_state, state_path
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.joint import JointLearner
 from skillweave.training.keep_best import KeepBest
@@ -201,7 +200,7 @@ class Agents:
         state = algorithm.init([self._seeds(name) / "member" / 0])
         if earlier is None:
             return state
-        if self.together and (kept := load_state(self.stage.run, name, state)) is not None:
+        if self.together and (kept := self.stage.run.load_state(name, state)) is not None:
             return kept
         policy, steps = earlier
         algorithm.set_weights(state, policy.weights)
@@ -211,7 +210,7 @@ class Agents:
     def _report_lost_state(self, name: str) -> None:
         """Report a deleted file of a state."""
         latest = self._latest_stage(name)
-        path = state_path(self.stage.run, name)
+        path = self.stage.run.file("states", name)
         trained = latest is not None and latest.evolution is None and not latest.undone
         if trained and not path.exists():
             self.log.message(

@@ -43,6 +43,19 @@ class SavedEvaluation:
         return header | self.evaluation.to_json()
 
 
+def load_evaluations(run: RunDirectory) -> dict[str, SavedEvaluation]:
+    """Return the saved evaluations of a run, by the names that ``Run.info`` gives them.
+
+    Raises:
+        RunError: a file is damaged, or belongs to another run.
+    """
+    known = {
+        "evaluation": load_evaluation(run),
+        "evaluation_sampled": load_evaluation(run, deterministic=False),
+    }
+    return {name: saved for name, saved in known.items() if saved is not None}
+
+
 def save_evaluation(
     run: RunDirectory, evaluation: Evaluation, seed: int, deterministic: bool
 ) -> None:
@@ -57,7 +70,7 @@ def save_evaluation(
     must_be_own(run.path)
     made = time.strftime("%Y-%m-%dT%H:%M:%S%z")
     saved = SavedEvaluation(made, seed, deterministic, evaluation, run.manifest.id)
-    write_json(run.path / _name(deterministic), saved, make_directories=False)
+    write_json(run.path / _name(deterministic), saved)
     _track(run, evaluation)
 
 

@@ -7,8 +7,6 @@ they failed, it is none. The observations were recorded before, so they cost no 
 
 from __future__ import annotations
 
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,14 +18,8 @@ from skillweave.algorithms.batches import Rehearsal
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.errors import RunError
-from skillweave.runs.directory import RunDirectory, file_name
-from skillweave.runs.files import (
-    check_unchanged,
-    make_directory,
-    read_signed,
-    remove,
-    write_tensors,
-)
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import check_unchanged, read_tensors
 from skillweave.runs.manifest import StageEntry
 from skillweave.spaces import to_tensor
 from skillweave.training.learner import RolloutLearner
@@ -56,14 +48,10 @@ def save_rehearsal(run: RunDirectory, stage: str, obs: Array) -> None:
     if len(obs) > most:
         rng = (Seeds(0) / KIND).numpy()
         obs = obs[np.sort(rng.choice(len(obs), most, replace=False))]
-    path = _path(run, stage)
-    make_directory(path.parent)
     tensors = {"obs": to_tensor(np.ascontiguousarray(obs))}
-    header = {"kind": KIND} | run.place(stage)
-    sha256 = write_tensors(path, tensors, header, make_directories=False)
     repair = run.stage(stage).repair
     assert repair is not None
-    repair.rehearsal = sha256
+    repair.rehearsal = run.write("starts", stage, tensors, {"kind": KIND}, stage)
 
 
 def rehearse(learner: RolloutLearner, run: RunDirectory, entry: StageEntry, policy: Any) -> None:
@@ -76,15 +64,15 @@ def rehearse(learner: RolloutLearner, run: RunDirectory, entry: StageEntry, poli
     if recorded is None:
         return
     assert isinstance(policy, AgentPolicy)
-    path = _path(run, entry.name)
+    path = run.file("starts", entry.name)
     if not path.exists():
         raise RunError(
             f"{path} is missing: the repair keeps to it what the skill could do. Restore the file, "
             "or repair again in another directory"
         )
-    tensors, header, sha256 = read_signed(path)
+    tensors, header = read_tensors(path)
     run.must_be_ours(header.get("run"), path)
-    check_unchanged(path, sha256, recorded)
+    check_unchanged(path, header, recorded)
     (stack,) = learner.stacks
     device = stack.state.params.device
     learner.rehearsal = rehearsal_of(policy, tensors["obs"].to(device), device)
@@ -103,15 +91,3 @@ def rehearsal_of(policy: AgentPolicy, obs: torch.Tensor, device: torch.device) -
     return Rehearsal(
         obs, dist_params.to(device), None if log_std is None else log_std.clone().to(device)
     )
-
-
-def remove_rehearsal(run: RunDirectory, entry: StageEntry) -> None:
-    """Remove the observations of a finished stage's rehearsal, if it has one."""
-    if entry.repair is not None and entry.repair.rehearsal is not None:
-        remove(_path(run, entry.name))
-        with suppress(OSError):  # it still holds others
-            (run.path / "starts").rmdir()
-
-
-def _path(run: RunDirectory, stage: str) -> Path:
-    return run.path / "starts" / f"{file_name(stage)}.safetensors"

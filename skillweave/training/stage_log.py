@@ -15,13 +15,10 @@ from skillweave.errors import RunError, SkillweaveError, reworded
 from skillweave.policies.files import shown
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import LINES, RunDirectory
-from skillweave.runs.initial_policies import remove_initial_policies
 from skillweave.runs.manifest import Best, BestSoFar, Checkpoint, Reached, StageEntry, Stopped
-from skillweave.runs.states import drop_states, learns_again, save_state
 from skillweave.runs.trackers import Listener
 from skillweave.training.callback import TrainCallback
 from skillweave.training.episodes import EpisodeTally
-from skillweave.training.rehearsal import remove_rehearsal
 
 ENOUGH = 20
 """Episodes after which a logged key of ``info`` that never occurred is reported."""
@@ -234,8 +231,9 @@ class StageLog:
         entry = self.entry
         at = self.at
         for name, state in states.items():
-            if learns_again(self.run, entry.name, name):
-                save_state(self.run, entry.name, name, state)
+            if self.run.learns_again(entry.name, name):
+                header = {"learns": name}
+                self.run.write("states", name, vars(state), header, entry.name)
         self._save_policies(policies)
         for name, policy in policies.items():
             policy.name_outliers(repr(name))
@@ -255,9 +253,7 @@ class StageLog:
                 "step by step, or states nearer to it: start_calls, episode_calls, initiation()"
             )
         self.run.drop_checkpoints()
-        drop_states(self.run, entry.name)
-        remove_initial_policies(self.run, entry.name)
-        remove_rehearsal(self.run, entry)
+        self.run.drop_used(entry)
         for listener in self.listeners:
             listener.done(entry.name, at.steps, at.seconds, at.metrics)
 

@@ -14,12 +14,10 @@ from skillweave.algorithms.policy import AgentPolicy
 from skillweave.planning.recorder import Recorder
 from skillweave.planning.run_log import save_calls
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.initial_policies import remove_initial_policies
 from skillweave.runs.manifest import Checkpoint, StageEntry
 from skillweave.runs.trackers import Listener
 from skillweave.training.agents import Agents
 from skillweave.training.learning_task import LearningTask
-from skillweave.training.rehearsal import remove_rehearsal
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import StageLog
 from skillweave.training.stage_run import MakeLearner, StageRun
@@ -67,8 +65,7 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
     run = course.run
     entry = run.stage(stage.name)
     if entry.done:
-        remove_initial_policies(run, stage.name)  # the run may have been killed just before
-        remove_rehearsal(run, entry)
+        run.drop_used(entry)  # the run may have been killed just before
         return run.load_policies(stage.name)
     seeds = Seeds(run.manifest.seed) / stage.name
     learning_task = stage.learning_task(earlier)
@@ -83,7 +80,7 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
     ):
         try:
             learner.open()
-            checkpoint = run.load_checkpoint(None, stage.name)
+            checkpoint = run.load_checkpoint(stage.name, None)
             _, at, extra = checkpoint or (None, Checkpoint.start(stage.name), {})
             log = StageLog(stage.name, run, course.listeners, at)
             learner.go_on(extra, log)

@@ -51,6 +51,7 @@ hierarchy = Hierarchy(
 '''
 CATCH = '    reflexes=[Reflex(lambda obs: obs[:, 2] > 0.1, action=1, name="catch")],\n'
 CODED = PLAIN.replace("    algorithm=small", CATCH + "    algorithm=small")
+QUIET = ("--evaluate", 0, "--quiet")
 KEYS = {"episodes", "mean", "std", "ci95", "iqm", "solved_fraction", "length_mean", "skill_usage"}
 
 
@@ -58,7 +59,6 @@ KEYS = {"episodes", "mean", "std", "ci95", "iqm", "solved_fraction", "length_mea
 class Answer:
     """What a command answered."""
 
-    code: int
     out: str
     err: str
 
@@ -85,23 +85,25 @@ def run_main(*arguments: object) -> int:
 def call(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Call:
-    """Runs a command in an empty directory, in this process."""
+    """Runs a command in an empty directory, in this process, and checks its exit code."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
 
-    def call(*arguments: object) -> Answer:
+    def call(*arguments: object, code: int = 0) -> Answer:
         capsys.readouterr()
-        code = run_main(*arguments)
+        ended = run_main(*arguments)
         out, err = capsys.readouterr()
-        return Answer(code, out, err)
+        assert ended == code, err
+        return Answer(out, err)
 
     return call
 
 
-def in_a_process(*arguments: object, cwd: Path) -> Answer:
+def in_a_process(*arguments: object, cwd: Path, code: int = 0) -> Answer:
     command = [sys.executable, "-m", "skillweave", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
-    return Answer(done.returncode, done.stdout, done.stderr)
+    assert done.returncode == code, done.stderr
+    return Answer(done.stdout, done.stderr)
 
 
 @dataclass
@@ -120,23 +122,22 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     folder = tmp_path_factory.mktemp("trained")
     (folder / "plain.py").write_text(PLAIN)
     (folder / "coded.py").write_text(CODED)
-    found = Trained(
-        folder / "plain.py",
-        folder / "coded.py",
-        folder / "plain-run",
-        folder / "coded-run",
-        folder / "flat-run",
-    )
-    common = ("--evaluate", 0, "--quiet")
-    assert run_main("train", found.plain, "-o", found.plain_run, *common) == 0
-    assert run_main("train", found.coded, "-o", found.coded_run, *common) == 0
-    assert run_main("train", found.coded, "-o", found.flat_run, "--flat", *common) == 0
+    names = "plain.py", "coded.py", "plain-run", "coded-run", "flat-run"
+    found = Trained(*(folder / name for name in names))
+    assert run_main("train", found.plain, "-o", found.plain_run, *QUIET) == 0
+    assert run_main("train", found.coded, "-o", found.coded_run, *QUIET) == 0
+    assert run_main("train", found.coded, "-o", found.flat_run, "--flat", *QUIET) == 0
     return found
+
+
+def copy_of(run: Path, folder: Path) -> Path:
+    """A copy of a run, without its evaluations."""
+    ignored = shutil.ignore_patterns("evaluation*.json")
+    return shutil.copytree(run, folder / "run", ignore=ignored)
 
 
 def score(call: Call, *arguments: object) -> dict[str, Any]:
     answer = call("evaluate", *arguments, "--episodes", 4, "--json")
-    assert answer.code == 0, answer.err
     return {k: v for k, v in answer.json.items() if k != "target"}
 
 
@@ -145,7 +146,6 @@ def score(call: Call, *arguments: object) -> dict[str, Any]:
 
 def test_help_lists_every_command(call: Call) -> None:
     answer = call("--help")
-    assert answer.code == 0
     listed = answer.out.split("subcommands")[1]
     assert all(f"• {name} " in listed for name in COMMANDS)
 
@@ -154,7 +154,6 @@ def test_help_lists_every_command(call: Call) -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_of_its_own(call: Call, command: str) -> None:
     answer = call(command, "--help")
-    assert answer.code == 0
     assert f"usage: skillweave {command}" in answer.out
     assert "--json" in answer.out
 
@@ -163,8 +162,7 @@ def test_no_arguments_mean_no_arguments_whatever_the_process_was_called_with(
     call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["pytest", "list"])
-    answer = call()
-    assert answer.code == 2
+    answer = call(code=2)
     assert "recipes:" not in answer.out
 
 
@@ -175,7 +173,6 @@ def test_train_prints_one_json_object_and_tells_progress_on_stderr(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
     answer = call("train", trained.plain, "-o", tmp_path / "run", "--evaluate", 2, "--json")
-    assert answer.code == 0
     assert answer.json["run"] == str(tmp_path / "run")
     assert [p["name"] for p in answer.json["stages"]] == ["left", "balance", "selector"]
     assert all(p["status"] == "done" for p in answer.json["stages"])
@@ -189,12 +186,10 @@ def test_train_and_evaluate_in_a_process_of_their_own_print_one_json_object(
 ) -> None:
     common = ("--evaluate", 0, "--json")
     answer = in_a_process("train", trained.coded, "-o", "run", *common, cwd=tmp_path)
-    assert answer.code == 0, answer.err
     assert answer.json["run"] == "run"
     assert "selector (3 of 3): training for 512 steps" in answer.err
     arguments = ("evaluate", "run", "--recipe", trained.coded, "--episodes", 3, "--json")
     answer = in_a_process(*arguments, cwd=tmp_path)
-    assert answer.code == 0, answer.err
     assert set(answer.json) >= KEYS
     assert answer.err == ""
 
@@ -203,27 +198,19 @@ def test_train_tells_people_where_the_run_is_and_how_well_it_does(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
     answer = call("train", trained.plain, "-o", tmp_path / "run", "--evaluate", 2)
-    assert answer.code == 0
     assert answer.out.startswith("trained 1,")
     assert "over 2 episodes" in answer.out
     assert f"run     {tmp_path / 'run'}" in answer.out
 
 
-def test_quiet_training_says_nothing_on_stderr(
-    call: Call, trained: Trained, tmp_path: Path
-) -> None:
-    answer = call(
-        "train", trained.plain, "-o", tmp_path / "run", "--evaluate", 0, "--quiet", "--json"
-    )
-    assert (answer.code, answer.err) == (0, "")
-
-
 def test_train_without_a_directory_takes_a_free_one_under_runs(
     call: Call, trained: Trained
 ) -> None:
-    common = ("--evaluate", 0, "--quiet", "--json", "--scale", 0.1)
-    names = [call("train", trained.plain, *common).json["run"] for _ in range(2)]
-    names.append(call("train", trained.plain, "--seed", 5, "--flat", *common).json["run"])
+    names = []
+    for more in ((), (), ("--seed", 5, "--flat")):
+        answer = call("train", trained.plain, *QUIET, "--json", "--scale", 0.1, *more)
+        assert answer.err == "", "it is quiet"
+        names.append(answer.json["run"])
     assert names == ["runs/plain-1", "runs/plain-2", "runs/plain-flat-1"]
     assert all((Path(name) / "run.json").exists() for name in names)
 
@@ -231,11 +218,9 @@ def test_train_without_a_directory_takes_a_free_one_under_runs(
 def test_train_into_an_existing_run_refuses_and_changes_nothing(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(trained.plain_run, run)
+    run = copy_of(trained.plain_run, tmp_path)
     before = {p: p.read_bytes() for p in run.rglob("*.*")}
-    answer = call("train", trained.plain, "-o", run, "--seed", 9)
-    assert answer.code == 1
+    answer = call("train", trained.plain, "-o", run, "--seed", 9, code=1)
     assert answer.out == ""
     assert f"error: {run} holds a finished run" in answer.err
     assert f"skillweave resume {run}" in answer.err
@@ -246,8 +231,8 @@ def test_scale_and_set_change_budgets_and_settings(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
     answer = call(
-        "train", trained.plain, "-o", tmp_path / "run", "--scale", 0.5, "--evaluate", 0, "--json",
-        "--set", "skills.left.steps=130", "--set", "selector.gamma=0.9", "--quiet",
+        "train", trained.plain, "-o", tmp_path / "run", "--scale", 0.5, *QUIET, "--json",
+        "--set", "skills.left.steps=130", "--set", "selector.gamma=0.9",
     )  # fmt: skip
     left, balance, selector = answer.json["stages"]
     assert (left["budget"], balance["budget"], selector["budget"]) == (65, 128, 256)
@@ -259,12 +244,11 @@ def test_settings_that_only_fit_together_may_be_given_in_any_order(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
     # A minibatch of 400 does not fit into the recipe's rollout of 4·16 steps.
-    common = ("--evaluate", 0, "--quiet", "--json", "--scale", 0.1)
     settings = ["selector.num_envs=20", "selector.n_steps=20", "selector.batch_size=400"]
     for number, order in enumerate((settings, settings[::-1])):
         flags = [part for setting in order for part in ("--set", setting)]
-        answer = call("train", trained.plain, "-o", tmp_path / f"run{number}", *flags, *common)
-        assert answer.code == 0, answer.err
+        path = tmp_path / f"run{number}"
+        call("train", trained.plain, "-o", path, *flags, *QUIET, "--json", "--scale", 0.1)
 
 
 def test_the_flat_baseline_trains_on_as_many_steps_as_the_hierarchy(trained: Trained) -> None:
@@ -296,16 +280,12 @@ def test_training_a_shipped_recipe_twice_in_one_process_scales_it_once(
     budgets = ("apart.skill_steps=100", "skills.landing.steps=100", "apart.selector_steps=100")
     budgets += ("together.steps=100",)
     small = (*(part for b in budgets for part in ("--set", b)), "--scale", 0.5)
-    tiny = [f"algorithm.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
-    tiny += [f"skills.landing.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
-    tiny += [f"selector.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
+    owners = ("algorithm", "skills.landing", "selector")
+    tiny = [f"{o}.{k}" for o in owners for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
     sets = [part for setting in tiny for part in ("--set", setting)]
     for number in range(2):
         path = tmp_path / f"run{number}"
-        answer = call(
-            "train", "lunar-lander", "-o", path, *small, *sets, "--evaluate", 0, "--json", "--quiet"
-        )
-        assert answer.code == 0, answer.err
+        answer = call("train", "lunar-lander", "-o", path, *small, *sets, *QUIET, "--json")
         assert {p["budget"] for p in answer.json["stages"]} == {50}
     assert recipes.load("lunar-lander").total_steps == before
 
@@ -317,7 +297,6 @@ def test_evaluate_tells_people_a_line_and_programs_every_number(
     call: Call, trained: Trained
 ) -> None:
     answer = call("evaluate", trained.plain_run, "--episodes", 4)
-    assert answer.code == 0
     line, head, left, balance = answer.out.splitlines()
     assert "over 4 episodes" in line
     assert head.split() == [
@@ -369,7 +348,6 @@ def test_a_weights_file_scores_as_the_run_it_was_written_from(
     recipe = ("--recipe", trained.coded)
     path = tmp_path / "w.safetensors"
     answer = call("weights", trained.coded_run, *recipe, "-o", path, "--json")
-    assert answer.code == 0, answer.err
     assert answer.json == {"path": str(path), "bytes": path.stat().st_size}
     assert score(call, path, *recipe) == score(call, trained.coded_run, *recipe)
 
@@ -380,7 +358,6 @@ def test_render_writes_a_film_and_says_what_is_in_it(
     pytest.importorskip("pygame")
     path = tmp_path / "film.gif"
     answer = call("render", trained.plain_run, "-o", path, "--json")
-    assert answer.code == 0, answer.err
     assert answer.json["path"] == str(path)
     assert path.read_bytes()[:4] == b"GIF8"
     assert answer.json["frames"] >= len(answer.json["episodes"]) == 1
@@ -392,18 +369,15 @@ def test_render_writes_a_film_and_says_what_is_in_it(
 def test_resuming_a_finished_run_scores_it_and_trains_no_more(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(trained.coded_run, run)
+    run = copy_of(trained.coded_run, tmp_path)
     arguments = ("--recipe", trained.coded, "--evaluate", 2, "--json")
     answer = call("resume", run, *arguments)
-    assert answer.code == 0, answer.err
     assert answer.json["evaluation"]["episodes"] == 2
     assert answer.json["stages"] == json.loads((run / "run.json").read_text())["stages"]
 
 
 def test_info_of_a_run_shows_its_stages_and_what_made_it(call: Call, trained: Trained) -> None:
     answer = call("info", trained.coded_run)
-    assert answer.code == 0
     assert "hierarchy on CartPole-v1, seed 0" in answer.out
     assert f"recipe: {trained.coded}" in answer.out
     assert all(name in answer.out for name in ("left", "balance", "selector", "torch"))
@@ -416,33 +390,28 @@ def test_info_of_a_run_shows_its_stages_and_what_made_it(call: Call, trained: Tr
 def test_calls_are_logged_shown_and_planned_on(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
-    run = shutil.copytree(trained.coded_run, tmp_path / "run")
+    run = copy_of(trained.coded_run, tmp_path)
     recipe = tmp_path / "words.py"
     tilted = "    predicates={'tilted': lambda obs: abs(obs[:, 2]) > 0.1},\n    algorithm=small"
     recipe.write_text(CODED.replace("    algorithm=small", tilted))
     assert "after" not in call("info", run).out
-    unknown = call("plan", run, "tilt", "--recipe", recipe)
-    assert (unknown.code, "is 'tilted' meant?" in unknown.err) == (1, True)
+    assert "is 'tilted' meant?" in call("plan", run, "tilt", "--recipe", recipe, code=1).err
     assert not (run / "calls.safetensors").exists(), "an unknown word is named before recording"
     answer = call("log", run, "--recipe", recipe, "--steps", 300)
-    assert answer.code == 0, answer.err
     assert "recorded " in answer.out
     assert "A call is done if it ended" in answer.out or "No success() is known" in answer.out
     more = call("log", run, "--recipe", recipe, "--steps", 300, "--choose", "explore", "--json")
-    assert more.code == 0, more.err
     assert more.json["steps"] >= 600 > more.json["recorded"]["steps"]
     assert more.json["handover"]["skills"] == ["left", "balance"]
     shown = call("info", run)
     assert shown.out.splitlines()[-1].strip().startswith("No success()") or "elsewhere" in shown.out
     assert call("info", run, "--json").json["handover"] == more.json["handover"]
     planned = call("plan", run, "tilted", "--recipe", recipe, "--episodes", 3, "--json")
-    assert planned.code == 0, planned.err
     assert (planned.json["mission"], planned.json["episodes"]) == ("tilted", 3)
     assert planned.json["success_rate"] == 1.0
     film = call(
         "plan", run, "tilted", "--recipe", recipe, "--episodes", 1, "-o", tmp_path / "f.gif"
     )
-    assert film.code == 0, film.err
     assert "f.gif: " in film.out
     (run / "calls.safetensors").write_bytes(b"damaged")
     assert "log of calls: " in call("info", run).out
@@ -450,17 +419,16 @@ def test_calls_are_logged_shown_and_planned_on(
 
 
 def test_a_plan_without_a_log_records_one(call: Call, trained: Trained, tmp_path: Path) -> None:
-    run = shutil.copytree(trained.plain_run, tmp_path / "run")
+    run = copy_of(trained.plain_run, tmp_path)
     recipe = tmp_path / "words.py"
     far = "    predicates={'far': lambda obs: abs(obs[:, 0]) > 0.05},\n    algorithm=small"
     recipe.write_text(PLAIN.replace("    algorithm=small", far))
     arguments = ("--recipe", recipe, "--episodes", 2, "--steps", 400)
     answer = call("plan", run, "far", *arguments)
-    assert answer.code == 0, answer.err
     assert "recording 400 steps" in answer.err
     assert "recording" not in call("plan", run, "far", *arguments).err
     assert "without the code of its skills" in call("log", run, "--steps", 50).err
-    assert call("log", trained.flat_run, "--recipe", trained.coded).code == 1
+    call("log", trained.flat_run, "--recipe", trained.coded, code=1)
 
 
 PICTURES = """
@@ -516,23 +484,20 @@ def test_a_world_of_images_is_planned_by_declared_features(call: Call, tmp_path:
     )
     (tmp_path / "seeing.py").write_text(seeing)
     run = tmp_path / "run"
-    assert call("train", tmp_path / "blind.py", "-o", run, "--evaluate", 0).code == 0
-    answer = call("plan", run, "end", "--recipe", tmp_path / "blind.py")
-    assert (answer.code, "features" in answer.err) == (1, True)
+    call("train", tmp_path / "blind.py", "-o", run, "--evaluate", 0)
+    assert "features" in call("plan", run, "end", "--recipe", tmp_path / "blind.py", code=1).err
     assert not (run / "calls.safetensors").exists(), "they are missed before recording"
     with pytest.warns(UserWarning, match="features"):
         call("log", run, "--recipe", tmp_path / "blind.py", "--steps", 400)
     arguments = ("--recipe", tmp_path / "seeing.py", "--episodes", 5, "--json")
     planned = call("plan", run, "end", *arguments)
-    assert planned.code == 0, planned.err
     assert planned.json["success_rate"] == 1.0
 
 
 def test_info_tells_the_latest_evaluation_as_evaluate_did(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(trained.plain_run, run, ignore=shutil.ignore_patterns("evaluation.json"))
+    run = copy_of(trained.plain_run, tmp_path)
     assert "evaluation" not in call("info", run, "--json").json
     call("evaluate", run, "--episodes", 2)
     arguments = ("evaluate", run, "--recipe", trained.plain, "--episodes", 3, "--seed", 2)
@@ -549,9 +514,7 @@ def test_info_tells_the_latest_evaluation_as_evaluate_did(
 def test_a_sampled_evaluation_is_kept_beside_the_score(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
-    run = tmp_path / "run"
-    ignored = shutil.ignore_patterns("evaluation*.json")
-    shutil.copytree(trained.plain_run, run, ignore=ignored)
+    run = copy_of(trained.plain_run, tmp_path)
     call("evaluate", run, "--episodes", 2)
     score = read_json(run / "evaluation.json")
     call("evaluate", run, "--episodes", 3, "--stochastic")
@@ -566,11 +529,10 @@ def test_a_sampled_evaluation_is_kept_beside_the_score(
 def test_an_evaluation_that_cannot_be_kept_is_told_all_the_same(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(trained.plain_run, run, ignore=shutil.ignore_patterns("evaluation.json"))
+    run = copy_of(trained.plain_run, tmp_path)
     (run / "evaluation.json").mkdir()  # so that no file can have that name
     answer = call("evaluate", run, "--episodes", 2, "--json")
-    assert (answer.code, answer.json["episodes"]) == (0, 2)
+    assert answer.json["episodes"] == 2
     assert "the evaluation is not kept in the run: could not write" in answer.err
 
 
@@ -589,20 +551,18 @@ def test_an_evaluation_that_cannot_be_kept_is_told_all_the_same(
 def test_a_wrong_evaluation_file_is_told_by_file_and_field(
     call: Call, trained: Trained, tmp_path: Path, change: dict[str, Any], says: str
 ) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(trained.plain_run, run)
+    run = copy_of(trained.plain_run, tmp_path)
     call("evaluate", run, "--episodes", 2)
     file = run / "evaluation.json"
     write_json(file, read_json(file) | change)
-    answer = call("info", run)
-    assert (answer.code, answer.out) == (1, "")
+    answer = call("info", run, code=1)
+    assert answer.out == ""
     assert says in answer.err
     assert "evaluation.json" in answer.err
 
 
 def test_a_python_user_may_keep_an_evaluation_too(trained: Trained, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(trained.plain_run, run, ignore=shutil.ignore_patterns("evaluation.json"))
+    run = copy_of(trained.plain_run, tmp_path)
     loaded = recipes.load(trained.plain).load(run)
     loaded.evaluate(2)
     assert "evaluation" not in loaded.info()
@@ -624,9 +584,7 @@ def test_info_of_a_recipe_shows_settings_that_can_be_set(
     lines = call("info", trained.plain).out.splitlines()
     assert {line.split("=")[0] for line in lines} == set(settings)
     flags = [part for line in lines for part in ("--set", line)]
-    common = ("--evaluate", 0, "--quiet", "--scale", 0.1)
-    answer = call("train", trained.plain, "-o", tmp_path / "run", *flags, *common)
-    assert answer.code == 0, answer.err
+    call("train", trained.plain, "-o", tmp_path / "run", *flags, *QUIET, "--scale", 0.1)
 
 
 def test_list_shows_recipes_and_the_runs_here_even_a_damaged_one(
@@ -637,7 +595,6 @@ def test_list_shows_recipes_and_the_runs_here_even_a_damaged_one(
         Path("runs", name).mkdir()
         Path("runs", name, "run.json").write_text(text)
     answer = call("list", "--json")
-    assert answer.code == 0, answer.err
     assert [r["name"] for r in answer.json["recipes"]] == recipes.names()
     runs = {r["path"]: r["status"] for r in answer.json["runs"]}
     assert runs["runs/flat"] == "finished"
@@ -688,8 +645,7 @@ def test_a_mistake_is_explained_on_stderr_and_writes_nothing(
     call: Call, trained: Trained, arguments: list[str], code: int, said: list[str]
 ) -> None:
     names = {"PLAIN": trained.plain, "RUN": trained.plain_run, "FLAT": trained.flat_run}
-    answer = call(*[names.get(a, a) for a in arguments])
-    assert answer.code == code
+    answer = call(*[names.get(a, a) for a in arguments], code=code)
     assert answer.out == ""
     assert all(part in answer.err for part in said), answer.err
     assert list(Path().iterdir()) == []
@@ -700,8 +656,7 @@ def test_an_environment_that_does_not_exist_is_answered_with_close_matches(
 ) -> None:
     recipe = tmp_path / "typo.py"
     recipe.write_text(PLAIN.replace("CartPole-v1", "CartPool-v1"))
-    answer = call("train", recipe, "-o", "run")
-    assert answer.code == 1
+    answer = call("train", recipe, "-o", "run", code=1)
     assert "CartPool" in answer.err
     assert "CartPole-v1" in answer.err
     assert not Path("run").exists()
@@ -709,8 +664,7 @@ def test_an_environment_that_does_not_exist_is_answered_with_close_matches(
 
 def test_a_file_without_a_hierarchy_says_so(call: Call, tmp_path: Path) -> None:
     (tmp_path / "empty.py").write_text("x = 1\n")
-    answer = call("train", tmp_path / "empty.py")
-    assert answer.code == 1
+    answer = call("train", tmp_path / "empty.py", code=1)
     assert "defines no Hierarchy" in answer.err
 
 
@@ -723,15 +677,14 @@ def test_a_file_that_trains_as_soon_as_it_is_read_says_so(
 ) -> None:
     file = tmp_path / "script.py"
     file.write_text(f"{PLAIN}\nfrom skillweave import train_agent\n{line}\n")
-    answer = call("train", file, "-o", "run")
-    assert answer.code == 1
+    answer = call("train", file, "-o", "run", code=1)
     assert f"{file} starts training on import" in " ".join(answer.err.split())
     assert "__main__" in answer.err
     assert not Path("inner").exists()
     assert not Path("run").exists()
     # The same lines in that block: the file is both a script and a recipe.
     file.write_text(f"{PLAIN}\nif __name__ == '__main__':\n    hierarchy.train('inner')\n")
-    assert call("train", file, "-o", "run", "--scale", "0.2").code == 0
+    call("train", file, "-o", "run", "--scale", "0.2")
     assert not Path("inner").exists()
 
 
@@ -741,26 +694,24 @@ def test_a_file_that_resumes_a_run_as_soon_as_it_is_read_may_do_so_only_if_that_
     file = tmp_path / "script.py"
     file.write_text(PLAIN + "\nhierarchy.resume('run', quiet=True)\n")
     shutil.copytree(trained.plain_run, "run")
-    assert call("info", file).code == 0
+    call("info", file)
     shutil.rmtree("run")
     with monkeypatch.context() as patched:
         interrupt_at_checkpoint(patched, 1)
-        assert call("train", trained.plain, "-o", "run").code != 0
-    answer = call("info", file)
-    assert answer.code == 1
+        call("train", trained.plain, "-o", "run", code=130)
+    answer = call("info", file, code=1)
     assert "starts training on import" in " ".join(answer.err.split())
 
 
 def test_a_failed_command_with_json_prints_one_json_object_too(call: Call) -> None:
-    answer = call("train", "lunar-landr", "--json")
-    assert answer.code == 1
+    answer = call("train", "lunar-landr", "--json", code=1)
     assert set(answer.json) == {"error"}
     assert "lunar-lander" in answer.json["error"]
 
 
 def test_exit_codes_reach_the_shell(tmp_path: Path) -> None:
-    assert in_a_process("info", "nothing", cwd=tmp_path).code == 1
-    assert in_a_process("infos", cwd=tmp_path).code == 2
+    in_a_process("info", "nothing", cwd=tmp_path, code=1)
+    in_a_process("infos", cwd=tmp_path, code=2)
 
 
 # A run never runs code
@@ -770,8 +721,7 @@ def test_a_run_of_a_users_file_is_not_loaded_without_pointing_to_the_file(
     call: Call, trained: Trained
 ) -> None:
     for command in ("evaluate", "render", "resume", "weights"):
-        answer = call(command, trained.coded_run)
-        assert answer.code == 1
+        answer = call(command, trained.coded_run, code=1)
         assert "--recipe FILE.py" in answer.err
         assert str(trained.coded) in answer.err
     assert score(call, trained.coded_run, "--recipe", trained.coded)["episodes"] == 4
@@ -795,8 +745,7 @@ def test_a_flat_run_needs_nothing_of_the_skills_that_it_was_not_trained_with(
     text = PLAIN.replace("call_steps=5", "call_steps=None")
     stops = "    def termination(self, step):\n        return step.reward > 2\n"
     recipe.write_text(text.replace("    pass\n", stops))
-    common = ("--flat", "--evaluate", 0, "--quiet")
-    assert call("train", recipe, "-o", tmp_path / "run", *common).code == 0
+    call("train", recipe, "-o", tmp_path / "run", "--flat", *QUIET)
     assert score(call, tmp_path / "run")["episodes"] == 4
 
 
@@ -806,8 +755,7 @@ def test_a_run_of_other_skills_is_not_loaded_into_a_hierarchy(
     (tmp_path / "other.py").write_text(PLAIN.replace("class Balance", "class Stand"))
     other = PLAIN.replace("Left(), Balance()", "Left(), Stand()").replace("Balance", "Stand")
     (tmp_path / "other.py").write_text(other)
-    answer = call("evaluate", trained.plain_run, "--recipe", tmp_path / "other.py")
-    assert answer.code == 1
+    answer = call("evaluate", trained.plain_run, "--recipe", tmp_path / "other.py", code=1)
     assert "left, balance" in answer.err
     assert "left, stand" in answer.err
 
@@ -842,8 +790,7 @@ def test_code_inside_a_run_is_never_executed(
     marker = trap(run, trained.coded_run, recipe.replace("RUN", str(run)), needs_recipe=True)
     monkeypatch.chdir(run)
     monkeypatch.syspath_prepend(run)
-    answer = call(command, run)
-    assert answer.code == (0 if command == "info" else 1)
+    call(command, run, code=0 if command == "info" else 1)
     assert not marker.exists()
 
 
@@ -863,7 +810,7 @@ def test_an_environment_named_by_a_run_never_imports_code(
     marker = trap(run, source, "trap.py", env="trap:CartPole-v1", needs_recipe=False)
     monkeypatch.chdir(run)
     monkeypatch.syspath_prepend(run)
-    assert call(command, run).code == 1
+    call(command, run, code=1)
     assert not marker.exists()
 
 
@@ -877,13 +824,12 @@ def test_a_weights_file_that_names_code_is_refused(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
     path = tmp_path / "w.safetensors"
-    assert call("weights", trained.coded_run, "--recipe", trained.coded, "-o", path).code == 0
+    call("weights", trained.coded_run, "--recipe", trained.coded, "-o", path)
     tensors, header = read_tensors(path)
     marker = tmp_path / "executed"
     (tmp_path / "trap.py").write_text(TRAP.format(marker=str(marker)) + PLAIN)
     write_tensors(path, tensors, header | {"recipe": str(tmp_path / "trap.py")})
-    answer = call("evaluate", path)
-    assert answer.code == 1
+    answer = call("evaluate", path, code=1)
     assert "--recipe" in answer.err
     assert not marker.exists()
 
@@ -892,10 +838,10 @@ def test_an_error_is_one_line_and_its_traceback_is_shown_on_demand(
     call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sentence = "error: nowhere is neither a run nor a weights file\n"
-    assert call("evaluate", "nowhere").err == sentence
-    shown = call("evaluate", "nowhere", "--traceback").err
+    assert call("evaluate", "nowhere", code=1).err == sentence
+    shown = call("evaluate", "nowhere", "--traceback", code=1).err
     assert shown.startswith("Traceback (most recent call last)")
     assert "execute.py" in shown
     assert shown.endswith(sentence)
     monkeypatch.setenv("SKILLWEAVE_TRACEBACK", "1")
-    assert call("evaluate", "nowhere").err == shown
+    assert call("evaluate", "nowhere", code=1).err == shown

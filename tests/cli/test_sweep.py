@@ -34,16 +34,22 @@ hierarchy = Hierarchy(
 
 
 @pytest.fixture
-def asked(tmp_path):
-    """A command's words: ``asked(...)`` adds to them."""
-    recipe = tmp_path / "still.py"
-    recipe.write_text(RECIPE)
+def recipe(tmp_path):
+    file = tmp_path / "still.py"
+    file.write_text(RECIPE)
+    return file
 
-    def words(*more):
-        start = ["sweep", str(recipe), "--out", str(tmp_path / "runs"), "--evaluate", "3"]
-        return [*start, "--json", "--quiet", *more]
 
-    return words
+@pytest.fixture
+def swept(tmp_path, recipe, capsys):
+    """The command: it returns its exit code, and what it answers."""
+
+    def command(*more, file=recipe, out="runs"):
+        words = ["sweep", str(file), "--out", str(tmp_path / out), "--evaluate", "3"]
+        code = main([*words, "--json", "--quiet", *more])
+        return code, json.loads(capsys.readouterr().out)
+
+    return command
 
 
 @pytest.fixture
@@ -60,14 +66,9 @@ def trained(monkeypatch):
     return names
 
 
-def answer(capsys, words):
-    code = main(words)
-    return code, json.loads(capsys.readouterr().out)
-
-
-def test_each_combination_is_trained_with_each_seed_and_none_twice(capsys, asked, trained):
-    words = asked("--seeds", "0:2", "--set-each", "selector.gamma=0.9,0.99")
-    code, first = answer(capsys, words)
+def test_each_combination_is_trained_with_each_seed_and_none_twice(swept, trained):
+    each = "--set-each", "selector.gamma=0.9,0.99"
+    code, first = swept(*each, "--seeds", "0:2")
     assert code == 0
     names = [f"selector.gamma={g}-s{s}" for g in (0.9, 0.99) for s in (0, 1)]
     assert trained == names
@@ -77,31 +78,31 @@ def test_each_combination_is_trained_with_each_seed_and_none_twice(capsys, asked
     assert gammas == [0.9, 0.9, 0.99, 0.99]
     assert [g["settings"] for g in first["groups"]] == ["selector.gamma=0.9", "selector.gamma=0.99"]
     trained.clear()
-    assert answer(capsys, [*words[:-4], "--seeds", "0,1,4", *words[-2:]])[0] == 0
+    assert swept(*each, "--seeds", "0,1,4")[0] == 0
     assert trained == ["selector.gamma=0.9-s4", "selector.gamma=0.99-s4"]
     trained.clear()
-    assert answer(capsys, words) == (0, first)
+    assert swept(*each, "--seeds", "0:2") == (0, first)
     assert trained == []
 
 
 @pytest.mark.slow
-def test_a_run_that_was_stopped_goes_on_to_the_same_end(capsys, asked, trained, monkeypatch):
-    one = asked("--seeds", "3:4")
-    _, whole = answer(capsys, [w.replace("runs", "whole") for w in one])
+def test_a_run_that_was_stopped_goes_on_to_the_same_end(swept, trained, monkeypatch):
+    _, whole = swept("--seeds", "3:4", out="whole")
     interrupt_at_checkpoint(monkeypatch, 2)
-    assert main(one) == 130
-    assert "0 of 1 runs are finished; the same command continues" in capsys.readouterr().out
+    code, stopped = swept("--seeds", "3:4")
+    assert code == 130
+    assert "0 of 1 runs are finished; the same command continues" in stopped["error"]
     trained.clear()
-    _, found = answer(capsys, one)
+    _, found = swept("--seeds", "3:4")
     assert trained == ["s3"]
     assert found["runs"][0]["return"] == whole["runs"][0]["return"]
     ends = [RunDirectory.open(r["runs"][0]["run"]).stage("selector") for r in (whole, found)]
     assert ends[0].sha256 == ends[1].sha256
 
 
-def test_runs_of_other_settings_are_not_taken_for_these(capsys, asked, trained):
-    answer(capsys, asked("--seeds", "0:1"))
-    code, found = answer(capsys, asked("--seeds", "0:1", "--scale", "2"))
+def test_runs_of_other_settings_are_not_taken_for_these(swept, trained):
+    swept("--seeds", "0:1")
+    code, found = swept("--seeds", "0:1", "--scale", "2")
     assert code == 1
     assert "holds a run of other settings" in found["failed"][0]["error"]
     assert found["groups"] == [{"settings": "as declared", "runs": 0}]
@@ -110,14 +111,13 @@ def test_runs_of_other_settings_are_not_taken_for_these(capsys, asked, trained):
 # A sampled evaluation is kept beside the score, so the sweep's own is still there.
 @pytest.mark.parametrize(("how", "again"), [({"seed": 7}, ["s0"]), ({"deterministic": False}, [])])
 def test_an_evaluation_made_otherwise_is_not_taken_for_the_sweeps(
-    capsys, asked, trained, tmp_path, how, again
+    swept, recipe, trained, tmp_path, how, again
 ):
-    words = asked("--seeds", "0:1")
-    first = answer(capsys, words)
-    run = load(words[1]).load(tmp_path / "runs/s0")
+    first = swept("--seeds", "0:1")
+    run = load(str(recipe)).load(tmp_path / "runs/s0")
     run.evaluate(3, save=True, **how)
     trained.clear()
-    assert answer(capsys, words) == first
+    assert swept("--seeds", "0:1") == first
     assert trained == again
     saved = load_evaluation(RunDirectory.open(run.path))
     assert (saved.seed, saved.deterministic) == (0, True)
@@ -127,13 +127,12 @@ EDITED = RECIPE.replace("-abs(", "-2 * abs(")
 
 
 @pytest.fixture
-def helper(tmp_path, monkeypatch):
+def helper(recipe, tmp_path, monkeypatch):
     """A module of the user's own, from which the recipe takes a number and nothing else."""
     file = tmp_path / "helper_of_sweep/__init__.py"
     file.parent.mkdir()
     file.write_text("from .weights import WEIGHT\n")
     (file.parent / "weights.py").write_text("WEIGHT = 1\n")
-    recipe = tmp_path / "still.py"
     recipe.write_text(f"from helper_of_sweep import WEIGHT\n{recipe.read_text()}")
     monkeypatch.syspath_prepend(tmp_path)
     yield file.parent / "weights.py"
@@ -141,57 +140,52 @@ def helper(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
-def refused(capsys, words, *said):
-    assert main(words) == 1
-    error = capsys.readouterr().err
+def assert_refused(answer, *said):
+    code, found = answer
+    assert code == 1
     for text in said:
-        assert text in error
+        assert str(text) in found["error"]
 
 
 @pytest.mark.slow
-def test_an_edited_recipe_does_not_go_on_with_a_sweep(capsys, asked, trained, tmp_path):
-    recipe = tmp_path / "still.py"
-    first = answer(capsys, asked("--seeds", "0:1"))
+def test_an_edited_recipe_does_not_go_on_with_a_sweep(swept, recipe, trained, tmp_path):
+    first = swept("--seeds", "0:1")
     recipe.write_text(EDITED)
-    names = str(recipe), str(tmp_path / "runs"), "--out"
-    refused(capsys, asked("--seeds", "0:2"), *names)
-    refused(capsys, asked("--seeds", "0:2", "--flat"), *names)
+    for more in ((), ("--flat",)):
+        assert_refused(swept("--seeds", "0:2", *more), recipe, tmp_path / "runs", "--out")
     assert trained == ["s0"]
     recipe.write_text(RECIPE)
-    assert answer(capsys, asked("--seeds", "0:1")) == first
+    assert swept("--seeds", "0:1") == first
     moved = tmp_path / "elsewhere" / "still.py"
     moved.parent.mkdir()
     moved.write_text(RECIPE)
-    words = [str(moved) if w == str(recipe) else w for w in asked("--seeds", "0:1")]
-    assert answer(capsys, words) == first
+    assert swept("--seeds", "0:1", file=moved) == first
     moved.write_text(EDITED)
-    refused(capsys, words, str(moved), str(recipe))
+    assert_refused(swept("--seeds", "0:1", file=moved), moved, recipe)
     assert trained == ["s0"]
 
 
 @pytest.mark.parametrize("wrong", ["return lock", "raise NameError('lok')"])
 def test_a_recipe_that_failed_before_anything_was_learnt_may_be_mended(
-    capsys, asked, trained, tmp_path, wrong
+    swept, recipe, trained, wrong
 ):
-    recipe = tmp_path / "still.py"
     broken = RECIPE.replace("return -abs(step.next_obs[:, 1])", wrong)
     held = "import threading\nlock = threading.Lock()\n"  # it cannot be sent to a process
     recipe.write_text(held + broken if "lock" in wrong else broken)
-    assert main(asked("--seeds", "0:1")) == 1
-    capsys.readouterr()
+    assert swept("--seeds", "0:1")[0] == 1
     recipe.write_text(RECIPE)
-    code, found = answer(capsys, asked("--seeds", "0:1"))
+    code, found = swept("--seeds", "0:1")
     assert code == 0
     assert isinstance(found["runs"][0]["return"], float)
 
 
 @pytest.mark.slow
-def test_nor_does_one_whose_module_was_edited(capsys, asked, helper, trained, tmp_path):
-    first = answer(capsys, asked("--seeds", "0:1"))
+def test_nor_does_one_whose_module_was_edited(swept, helper, recipe, trained):
+    first = swept("--seeds", "0:1")
     helper.write_text("WEIGHT = 2\n")
-    refused(capsys, asked("--seeds", "0:1"), str(tmp_path / "still.py"))
+    assert_refused(swept("--seeds", "0:1"), recipe)
     helper.write_text("WEIGHT = 1\n")
-    assert answer(capsys, asked("--seeds", "0:1")) == first
+    assert swept("--seeds", "0:1") == first
 
 
 def test_of_a_shipped_recipe_its_parts_count_and_nothing_else_of_the_library():
@@ -216,39 +210,35 @@ DYING_RECIPE = RECIPE.replace("\nsmall", f"{DYING}\nsmall", 1).replace("[Still()
 
 
 @pytest.mark.slow
-def test_a_run_whose_process_dies_is_named_and_the_others_are_trained(capsys, asked, tmp_path):
-    (tmp_path / "still.py").write_text(DYING_RECIPE)
-    code, found = answer(capsys, asked("--seeds", "0:2", "--jobs", "1"))
+def test_a_run_whose_process_dies_is_named_and_the_others_are_trained(swept, recipe):
+    recipe.write_text(DYING_RECIPE)
+    code, found = swept("--seeds", "0:2", "--jobs", "1")
     assert code == 1
     assert [run["seed"] for run in found["runs"]] == [1], found["failed"]
     assert found["failed"][0]["run"].endswith("s0")
     assert "exit code 3" in found["failed"][0]["error"]
-    code, found = answer(capsys, asked("--seeds", "0:2"))
+    code, found = swept("--seeds", "0:2")
     assert (code, [run["seed"] for run in found["runs"]]) == (0, [0, 1])
 
 
-@pytest.mark.slow
-def test_a_run_in_a_process(capsys, asked):
-    code, found = answer(capsys, asked("--seeds", "2"))
-    assert (code, found["failed"]) == (0, [])
-    assert [run["seed"] for run in found["runs"]] == [2]
-
-
-def test_what_goes_wrong_in_a_run_is_told_and_the_others_are_trained(
-    capsys, asked, trained, tmp_path
-):
+def test_what_goes_wrong_in_a_run_is_told_and_the_others_are_trained(swept, trained, tmp_path):
     broken = tmp_path / "runs" / "s0"
     broken.mkdir(parents=True)
     (broken / "mine.txt").touch()
-    code, found = answer(capsys, asked("--seeds", "0:2"))
+    code, found = swept("--seeds", "0:2")
     assert code == 1
     assert [run["seed"] for run in found["runs"]] == [1]
     assert "s0 exists and is not an empty directory" in found["failed"][0]["error"]
 
 
 def test_the_table_has_interquartile_means_intervals_and_medians(tmp_path):
-    some = [("a=1", seed, tmp_path, value) for seed, value in enumerate([1.0, 2.0, 3.0, 10.0])]
-    result, text = summary([*some, ("a=2", 0, tmp_path, 7.0), ("a=2", 1, tmp_path, "no")], tmp_path)
+    scores = {"a=1": [1.0, 2.0, 3.0, 10.0], "a=2": [7.0, "no"]}
+    jobs = [
+        (sweep.Job(settings, seed, tmp_path, False, 1), score)
+        for settings, row in scores.items()
+        for seed, score in enumerate(row)
+    ]
+    result, text = summary(jobs, tmp_path)
     first, second = result["groups"]
     assert (first["runs"], first["iqm"], first["median"]) == (4, 2.5, 2.5)
     assert (first["least"], first["most"]) == (1.0, 10.0)
@@ -302,8 +292,8 @@ def test_ray_may_be_said_with_an_address_or_without(words, found):
     assert _with_addresses(words) == found
 
 
-def test_without_ray_the_extra_is_named(capsys, asked, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "ray", None)
-    for words in (["train", *asked()[1:2], "--ray"], asked("--ray")):
-        assert main(words) == 1
-        assert "pip install 'skillweave[ray]'" in capsys.readouterr().err
+def test_without_ray_the_extra_is_named(capsys, swept, recipe, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert main(["train", str(recipe), "--ray"]) == 1
+    assert "pip install 'skillweave[ray]'" in capsys.readouterr().err
+    assert_refused(swept("--ray"), "pip install 'skillweave[ray]'")

@@ -23,7 +23,6 @@ from skillweave.runs import files
 from skillweave.runs.files import (
     SCHEMA,
     read_json,
-    read_signed,
     read_tensors,
     write_bytes,
     write_json,
@@ -206,7 +205,6 @@ DAMAGED_JSON = {
     "not UTF-8": b'{"schema": 1, "x": "\xff\xfe"}',
     "a list": b"[1, 2]",
     "no schema": b'{"seed": 0}',
-    "a newer schema": json.dumps({"schema": SCHEMA + 1}).encode(),
 }
 
 
@@ -271,6 +269,7 @@ def tensors(tmp_path: Path) -> Path:
 
 def test_tensors_and_header_come_back_bit_for_bit(tensors: Path) -> None:
     found, header = read_tensors(tensors)
+    assert header.pop("sha256")
     assert header == {"schema": SCHEMA, "stage": "landing", "steps": 12}
     assert found.keys() == TENSORS.keys()
     for name, value in TENSORS.items():
@@ -291,17 +290,9 @@ def test_tensors_of_any_type_have_a_checksum(tmp_path: Path, dtype: torch.dtype)
     path = tmp_path / "x.safetensors"
     given = torch.arange(6.0).reshape(2, 3).to(dtype)
     sha256 = write_tensors(path, {"x": given, "scalar": given[0, 0].clone()}, {})
-    found, _, told = read_signed(path)
-    assert told == sha256
+    found, header = read_tensors(path)
+    assert header["sha256"] == sha256
     assert torch.equal(found["x"].view(torch.uint8), given.view(torch.uint8))
-
-
-@pytest.mark.parametrize("text", ["[" * 3000 + "]" * 3000, '{"schema": 1, "x": NaN}', "5"])
-def test_a_header_that_is_nested_deep_or_no_object_is_damaged(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "x.safetensors"
-    path.write_bytes(safetensors.torch.save({"x": torch.zeros(2)}, {"skillweave": text}))
-    with pytest.raises(RunError, match=r"x\.safetensors"):
-        read_tensors(path)
 
 
 def test_the_same_content_gives_the_same_bytes(tensors: Path) -> None:
@@ -329,14 +320,7 @@ def test_a_file_altered_in_any_byte_is_an_error_that_names_it(tensors: Path, fli
         with pytest.raises(RunError) as caught:
             read_tensors(tensors)
         assert str(tensors) in str(caught.value)
-
-
-def test_altered_weights_are_told_by_their_checksum(tensors: Path) -> None:
-    altered = bytearray(tensors.read_bytes())
-    altered[-1] ^= 1
-    tensors.write_bytes(altered)
-    with pytest.raises(RunError, match="checksum"):
-        read_tensors(tensors)
+    assert "checksum" in str(caught.value), "the last byte is of a weight"
 
 
 FOREIGN: dict[str, dict[str, str] | None] = {
@@ -344,6 +328,8 @@ FOREIGN: dict[str, dict[str, str] | None] = {
     "other metadata": {"format": "pt"},
     "a header that is no object": {"skillweave": "[1]", "sha256": ""},
     "a header that is no JSON": {"skillweave": "{", "sha256": ""},
+    "a header that is nested deep": {"skillweave": "[" * 3000 + "]" * 3000},
+    "a header with NaN": {"skillweave": '{"schema": 1, "x": NaN}'},
     "no schema": {"skillweave": "{}", "sha256": ""},
     "no checksum": {"skillweave": '{"schema": 1}'},
 }

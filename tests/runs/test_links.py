@@ -13,13 +13,9 @@ import pytest
 from skillweave import Agent, SkillweaveError
 from skillweave.cli import main
 from skillweave.errors import RunError
-from tests.small_runs import ON, policies
+from tests.small_runs import ON, Stopped, policies, stop_at
 
 STEPS = 96
-
-
-class Stop(Exception):
-    pass
 
 
 def declared(steps: int = STEPS) -> Agent:
@@ -31,13 +27,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run, and one that was stopped after a checkpoint."""
     folder = tmp_path_factory.mktemp("runs")
     declared().train(folder / "finished", quiet=True, checkpoint_every=32)
-
-    def stop(event: object) -> None:
-        if event.steps >= 64:  # type: ignore[attr-defined]
-            raise Stop
-
-    with pytest.raises(Stop):
-        declared().train(folder / "stopped", quiet=True, checkpoint_every=32, callback=stop)
+    with pytest.raises(Stopped):
+        declared().train(folder / "stopped", quiet=True, checkpoint_every=32, callback=stop_at(64))
     return folder
 
 

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from skillweave import Agent, Apart, Hierarchy, SkillweaveError, Together, TrainDefaults
 from skillweave.cli import main
 from skillweave.evolution import Evolution
-from tests.small_runs import ON, Left, Push, policies
-
-
-class Stop(Exception):
-    pass
+from tests.small_runs import ON, Left, Push, Stopped, policies, stop_at
 
 
 def tree(factor: int = 1) -> Hierarchy:
@@ -32,13 +27,13 @@ def tree(factor: int = 1) -> Hierarchy:
     )
 
 
-def stopped(folder: Path, stage: str, steps: int) -> Path:
-    def stop(event: Any) -> None:
-        if event.stage == stage and event.steps >= steps:
-            raise Stop
+def agent(steps: int) -> Agent:
+    return Agent("CartPole-v1", ON, steps)
 
-    with pytest.raises(Stop):
-        tree().train(folder, quiet=True, callback=stop)
+
+def stopped(folder: Path, stage: str, steps: int) -> Path:
+    with pytest.raises(Stopped):
+        tree().train(folder, quiet=True, callback=stop_at(steps, stage))
     return folder
 
 
@@ -68,21 +63,14 @@ def test_files_that_going_on_does_not_need(name, runs, tmp_path):
 
 
 def test_lines_of_metrics(tmp_path, capsys):
-    def agent() -> Agent:
-        return Agent("CartPole-v1", ON, 160)
-
-    def stop(event: Any) -> None:
-        if event.steps >= 96:
-            raise Stop
-
-    with pytest.raises(Stop):
-        agent().train(tmp_path / "run", quiet=True, checkpoint_every=32, callback=stop)
+    with pytest.raises(Stopped):
+        agent(160).train(tmp_path / "run", quiet=True, checkpoint_every=32, callback=stop_at(96))
     run, file = tmp_path / "run", tmp_path / "run" / "metrics.jsonl"
     file.unlink()
-    agent().resume(run)
+    agent(160).resume(run)
     said = capsys.readouterr().err
     assert f"{file} was removed or shortened: curves lack its lines" in said
-    agent().train(tmp_path / "reference", quiet=True, checkpoint_every=32)
+    agent(160).train(tmp_path / "reference", quiet=True, checkpoint_every=32)
     assert policies(run) == policies(tmp_path / "reference")
     file.unlink()
     for words in (["info", str(run)], ["evaluate", str(run), "--episodes", "1"]):
@@ -93,9 +81,6 @@ def test_lines_of_metrics(tmp_path, capsys):
 
 @pytest.mark.parametrize("lost", ["all", "half"])
 def test_lines_of_metrics_of_a_finished_run_that_gets_more_steps(lost, tmp_path, capsys):
-    def agent(steps: int) -> Agent:
-        return Agent("CartPole-v1", ON, steps)
-
     run = agent(64).train(tmp_path / "run", quiet=True).path
     whole = shutil.copytree(run, tmp_path / "whole")
     file = run / "metrics.jsonl"
@@ -158,8 +143,7 @@ def test_the_final_state_of_a_run_that_gets_more_steps(runs, tmp_path):
 
 @pytest.mark.slow
 def test_the_lineage_of_a_population(tmp_path, capsys):
-    agent = Agent("CartPole-v1", ON, 600)
-    run = agent.train(tmp_path / "run", quiet=True, evolve=Evolution(population=3)).path
+    run = agent(600).train(tmp_path / "run", quiet=True, evolve=Evolution(population=3)).path
     (run / "lineage.jsonl").unlink()
     for words in (["info", str(run)], ["plot", str(run)], ["evaluate", str(run)]):
         main(words)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from small_runs import (
     Push,
     Stopped,
     assert_same,
-    interrupt_at_checkpoint,
+    interrupted,
     lines,
     plain_recipe,
     policies,
@@ -55,6 +57,16 @@ def nested(steps: int, **settings: Any) -> Hierarchy:
 
 def agent(steps: int, algorithm: Any = ON) -> Agent:
     return Agent(CARTPOLE, algorithm, steps)
+
+
+def train(path: Path, steps: int, algorithm: Any = ON, **how: Any) -> Run:
+    """Begin the run of an agent, or give it more steps."""
+    return agent(steps, algorithm).train(path, **{"resume": True, "quiet": True} | how)
+
+
+def final(path: Path) -> dict[str, torch.Tensor]:
+    """The final state of an agent."""
+    return read_tensors(path / "final/agent.safetensors")[0]
 
 
 KINDS: dict[str, Callable[[int], Any]] = {
@@ -136,10 +148,10 @@ def test_a_finished_run_learns_on_for_more_steps(kind: str, path: Path) -> None:
 
 
 def test_more_steps_continue_from_all_that_was_learnt(path: Path) -> None:
-    agent(256).train(path, quiet=True)
-    before = read_tensors(path / "final/agent.safetensors")[0]
-    agent(512).train(path, resume=True, quiet=True)
-    after = read_tensors(path / "final/agent.safetensors")[0]
+    train(path, 256)
+    before = final(path)
+    train(path, 512)
+    after = final(path)
     counts = [k for k in before if k in ("obs_count", "adam_step", "steps", "updates")]
     assert "obs_count" in counts
     for name in counts:
@@ -148,14 +160,14 @@ def test_more_steps_continue_from_all_that_was_learnt(path: Path) -> None:
 
 
 def test_a_run_that_a_callback_ended_learns_on(path: Path) -> None:
-    agent(512).train(path, quiet=True, callback=lambda event: event.steps < 200)
+    train(path, 512, callback=lambda event: event.steps < 200)
     ended = stages(path)["agent"]
     assert 200 <= ended.steps < 512
     assert ended.stopped is not None
     assert ended.stopped.steps == ended.steps
-    agent(512).train(path, resume=True, quiet=True)
+    train(path, 512)
     assert stages(path)["agent"] == ended, "it is finished"
-    agent(1_024).train(path, resume=True, quiet=True)
+    train(path, 1_024)
     after = stages(path)["agent"]
     assert after.steps >= 1_024
     assert after.continued == [ended.steps]
@@ -170,7 +182,7 @@ def test_a_callback_that_has_ended_a_stage_is_not_called_again(path: Path) -> No
         calls.append(event)
         return event.steps < 200
 
-    agent(512).train(path, quiet=True, callback=stop)
+    train(path, 512, callback=stop)
     assert [event.steps >= 200 for event in calls].count(True) == 1
 
 
@@ -180,7 +192,7 @@ def test_an_error_of_a_callback_at_the_last_checkpoint_is_not_a_full_disk(path: 
             raise SkillweaveError("mine")
 
     with pytest.raises(SkillweaveError, match="mine"):
-        agent(256).train(path, quiet=True, callback=fail)
+        train(path, 256, callback=fail)
     assert stages(path)["agent"].status == "training"
     assert stages(agent(256).resume(path, quiet=True))["agent"].status == "done"
 
@@ -214,20 +226,20 @@ def test_the_best_weights_of_before_are_kept_if_none_are_better(
         return {"eval_return": -float(steps)} if steps // 128 > since // 128 else {}
 
     monkeypatch.setattr(PeriodicEvaluation, "due", worse_and_worse)
-    agent(512).train(path, quiet=True, keep="best", eval_every=128)
+    train(path, 512, keep="best", eval_every=128)
     best, kept = stages(path)["agent"].best, policies(path)
     assert best.steps < 256
-    last = read_tensors(path / "final/agent.safetensors")[0]["params"]
-    agent(1_024).train(path, resume=True, quiet=True)
+    last = final(path)["params"]
+    train(path, 1_024)
     assert stages(path)["agent"].best == best
     assert policies(path) == kept
-    assert not torch.equal(read_tensors(path / "final/agent.safetensors")[0]["params"], last)
+    assert not torch.equal(final(path)["params"], last)
 
 
 def test_new_episodes_are_not_those_of_the_beginning(path: Path, tmp_path: Path) -> None:
-    agent(128).train(path, quiet=True)
-    agent(256).train(path, resume=True, quiet=True)
-    agent(256).train(tmp_path / "whole", quiet=True)
+    train(path, 128)
+    train(path, 256)
+    train(tmp_path / "whole", 256)
     assert (
         policies(path)["agent.safetensors"][1]
         != policies(tmp_path / "whole")["agent.safetensors"][1]
@@ -236,9 +248,7 @@ def test_new_episodes_are_not_those_of_the_beginning(path: Path, tmp_path: Path)
 
 @pytest.mark.parametrize("kind", ["an agent with DQN", "apart"])
 @pytest.mark.slow
-def test_a_continued_run_that_is_stopped_ends_the_same(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_continued_run_that_is_stopped_ends_the_same(kind: str, tmp_path: Path) -> None:
     def train(path: Path, steps: int) -> None:
         KINDS[kind](steps).train(path, seed=3, resume=True, checkpoint_every=64, quiet=True)
 
@@ -247,10 +257,9 @@ def test_a_continued_run_that_is_stopped_ends_the_same(
         train(path, 512)
     train(whole, 1_024)
     for number in (1, 3):
-        with monkeypatch.context() as patched:
-            interrupt_at_checkpoint(patched, number)
-            with pytest.raises(KeyboardInterrupt, match=r"saved at .*resume=True\)"):
-                train(stopped, 1_024)
+        with interrupted(number) as stop:
+            train(stopped, 1_024)
+        assert re.search(r"saved at .*resume=True\)", str(stop.value))
     train(stopped, 1_024)
     assert_same(stopped, whole)
 
@@ -258,11 +267,11 @@ def test_a_continued_run_that_is_stopped_ends_the_same(
 def test_a_continuation_that_is_killed_at_once_continues(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    agent(256).train(path, quiet=True)
+    train(path, 256)
     with monkeypatch.context() as patched:
         patched.setattr(stage_log.StageLog, "tick", lambda *_: (_ for _ in ()).throw(Stopped))
         with pytest.raises(Stopped):
-            agent(512).train(path, resume=True, quiet=True)
+            train(path, 512)
     with pytest.raises(RunError, match=r"unfinished run, saved at 256 steps of agent"):
         agent(512).train(path, quiet=True)
     run = agent(512).resume(path, quiet=True)
@@ -274,7 +283,7 @@ def test_a_continuation_that_is_killed_at_once_continues(
 def test_a_run_killed_right_before_it_is_done_ends_the_same(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    agent(256, OFF).train(tmp_path / "whole", quiet=True)
+    train(tmp_path / "whole", 256, OFF)
     keep = RunDirectory.keep_final
 
     def killed(self: RunDirectory, stage: str) -> None:
@@ -284,18 +293,18 @@ def test_a_run_killed_right_before_it_is_done_ends_the_same(
     with monkeypatch.context() as patched:
         patched.setattr(RunDirectory, "keep_final", killed)
         with pytest.raises(Stopped):
-            agent(256, OFF).train(path, quiet=True)
-    agent(256, OFF).train(path, resume=True, quiet=True)
+            train(path, 256, OFF)
+    train(path, 256, OFF)
     assert_same(path, tmp_path / "whole")
-    agent(512, OFF).train(path, resume=True, quiet=True)
-    agent(512, OFF).train(tmp_path / "whole", resume=True, quiet=True)
+    train(path, 512, OFF)
+    train(tmp_path / "whole", 512, OFF)
     assert_same(path, tmp_path / "whole")
 
 
 def test_an_evaluation_of_the_policy_before_is_removed(path: Path) -> None:
-    agent(128).train(path, quiet=True).evaluate(1, save=True, quiet=True)
+    train(path, 128).evaluate(1, save=True, quiet=True)
     assert "evaluation" in agent(128).load(path).info()
-    assert "evaluation" not in agent(256).train(path, resume=True, quiet=True).info()
+    assert "evaluation" not in train(path, 256).info()
 
 
 def test_a_skill_that_learns_on_alone_makes_its_selector_old_and_it_is_said(
@@ -335,31 +344,38 @@ def test_a_small_replay_buffer_is_kept(
     path: Path, monkeypatch: pytest.MonkeyPatch, kept: bool
 ) -> None:
     monkeypatch.setattr(stage_log, "LARGEST_SPARE", 2**20 if kept else 100)
-    agent(256, OFF).train(path, quiet=True)
+    train(path, 256, OFF)
     names = RunDirectory.open(path).final_tensors("agent")
     assert any(".store." in name for name in names) == kept
     if not kept:
         with pytest.raises(RunError, match="would learn nothing in 20 more steps"):
-            agent(276, OFF).train(path, resume=True, quiet=True)
+            train(path, 276, OFF)
     before = policies(path)
-    run = agent(384, OFF).train(path, resume=True, quiet=True)
+    run = train(path, 384, OFF)
     assert stages(run)["agent"].steps == 384
     assert policies(path) != before
 
 
-@pytest.mark.parametrize("allowed", [0, 8_000])
-def test_a_full_disk_keeps_the_policy_and_says_what_is_not_kept(
-    path: Path, monkeypatch: pytest.MonkeyPatch, capfd, allowed: int
-) -> None:
+@contextmanager
+def full_disk(fails: Callable[[Path, bytes], bool]) -> Iterator[None]:
+    """A block in which some files cannot be written."""
     write = files.write_bytes
 
     def full(target: Path, data: bytes, **how: Any) -> None:
-        if "checkpoint" in target.name and len(data) > allowed:
+        if fails(target, data):
             raise RunError(f"could not write {target}: No space left on device")
         write(target, data, **how)
 
-    with monkeypatch.context() as patched:
-        patched.setattr(files, "write_bytes", full)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(files, "write_bytes", full)
+        yield
+
+
+@pytest.mark.parametrize("allowed", [0, 8_000])
+def test_a_full_disk_keeps_the_policy_and_says_what_is_not_kept(
+    path: Path, capfd, allowed: int
+) -> None:
+    with full_disk(lambda target, data: "checkpoint" in target.name and len(data) > allowed):
         run = agent(256, OFF).train(path)
     assert run.evaluate(1, quiet=True).mean > 0
     told = capfd.readouterr().err
@@ -368,24 +384,13 @@ def test_a_full_disk_keeps_the_policy_and_says_what_is_not_kept(
     assert ("its final state is not kept" in told) == (not names)
     if not names:
         with pytest.raises(RunError, match=r"final state.*start_from="):
-            agent(512, OFF).train(path, resume=True, quiet=True)
+            train(path, 512, OFF)
 
 
-def test_a_policy_takes_the_place_of_final_states_on_a_full_disk(
-    path: Path, monkeypatch: pytest.MonkeyPatch, capfd
-) -> None:
-    write, failed = files.write_bytes, []
-
-    def full(target: Path, data: bytes, **how: Any) -> None:
-        if target.name == "selector.safetensors" and (path / "final/left.safetensors").exists():
-            failed.append(1)
-            raise RunError(f"could not write {target}: No space left on device")
-        write(target, data, **how)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(files, "write_bytes", full)
+def test_a_policy_takes_the_place_of_final_states_on_a_full_disk(path: Path, capfd) -> None:
+    left = path / "final/left.safetensors"
+    with full_disk(lambda target, _: target.name == "selector.safetensors" and left.exists()):
         declare().train(path)
-    assert failed == [1]
     assert "the disk is full, so final states" in capfd.readouterr().err
     assert sorted(p.name for p in (path / "final").iterdir()) == ["selector.safetensors"]
     assert RunDirectory.open(path).finished
@@ -395,10 +400,10 @@ def test_a_policy_takes_the_place_of_final_states_on_a_full_disk(
 
 
 def test_a_copy_without_final_states_names_start_from(path: Path, tmp_path: Path) -> None:
-    agent(128).train(path, quiet=True)
+    train(path, 128)
     shutil.rmtree(path / "final")
     with pytest.raises(RunError, match="final state") as caught:
-        agent(256).train(path, resume=True, quiet=True)
+        train(path, 256)
     line = f'agent.train(start_from="{path}")'
     assert str(caught.value).endswith(line)
     assert stages(path)["agent"].budget == 128
@@ -406,11 +411,11 @@ def test_a_copy_without_final_states_names_start_from(path: Path, tmp_path: Path
 
 
 def test_a_damaged_final_state_changes_nothing(path: Path) -> None:
-    agent(128).train(path, quiet=True)
+    train(path, 128)
     file, before = path / "final/agent.safetensors", (path / "run.json").read_bytes()
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(RunError, match=r"final/agent\.safetensors is damaged"):
-        agent(256).train(path, resume=True, quiet=True)
+        train(path, 256)
     assert (path / "run.json").read_bytes() == before
     assert agent(128).load(path).evaluate(1, quiet=True)
 
@@ -427,13 +432,9 @@ def test_a_population_is_refused(path: Path) -> None:
             agent(256).train(path, evolve=evolve, resume=True, quiet=True)
 
 
-def test_a_stage_that_is_done_waits_for_the_end_of_its_run(
-    path: Path, monkeypatch: pytest.MonkeyPatch, capfd
-) -> None:
-    with monkeypatch.context() as patched:
-        interrupt_at_checkpoint(patched, 2)
-        with pytest.raises(KeyboardInterrupt):
-            declare(256).train(path, checkpoint_every=100, quiet=True)
+def test_a_stage_that_is_done_waits_for_the_end_of_its_run(path: Path, capfd) -> None:
+    with interrupted(2):
+        declare(256).train(path, checkpoint_every=100, quiet=True)
     assert [e.status for e in stages(path).values()].count("done") == 1
     run = declare(512).train(path, resume=True)
     assert "left can be given more steps once the run is finished" in capfd.readouterr().err
@@ -455,15 +456,11 @@ def test_resume_begins_where_there_is_nothing(path: Path, tmp_path: Path) -> Non
     assert policies(path) == before
 
 
-def test_resume_continues_what_was_stopped(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_resume_continues_what_was_stopped(path: Path, tmp_path: Path) -> None:
     declare().train(tmp_path / "whole", checkpoint_every=64, quiet=True)
     for number in (1, 2):
-        with monkeypatch.context() as patched:
-            interrupt_at_checkpoint(patched, number)
-            with pytest.raises(KeyboardInterrupt):
-                declare().train(path, resume=True, checkpoint_every=64, quiet=True)
+        with interrupted(number):
+            declare().train(path, resume=True, checkpoint_every=64, quiet=True)
     declare().train(path, resume=True, quiet=True)
     assert_same(path, tmp_path / "whole")
 

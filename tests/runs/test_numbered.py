@@ -13,7 +13,16 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
-from small_runs import ON, Left, StopAt, Stopped, interrupt_at_checkpoint, new_run
+from small_runs import (
+    ON,
+    Left,
+    StopAt,
+    Stopped,
+    interrupt_at_checkpoint,
+    interrupted,
+    new_run,
+    plain_recipe,
+)
 
 import skillweave as sw
 from skillweave import Agent, EnvSpec, Hierarchy
@@ -25,23 +34,14 @@ from skillweave.runs.lock import Lock
 from skillweave.runs.numbered import make_numbered, safe_name
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
-RECIPE = """
-from skillweave import *
-
-class Left(Skill):
-    max_steps = 15
-
-    def reward(self, step):
-        return -step.next_obs[:, 0]
-
-on = PPO(num_envs=4, n_steps=8, batch_size=16, update_epochs=2, network=Network((8,)))
-env = EnvSpec("CartPole-v1", engine="sync", workers=1)
-hierarchy = Hierarchy(env, [Left()], algorithm=on, selector=on, steps=64)
-"""
 
 
 def declare(steps: int = 64, name: str = "hierarchy") -> Hierarchy:
     return Hierarchy(CARTPOLE, [Left()], algorithm=ON, selector=ON, steps=steps, name=name)
+
+
+def train(path: str = "run", **how: Any) -> sw.Run:
+    return declare().train(path, quiet=True, **how)
 
 
 @pytest.fixture(autouse=True)
@@ -119,7 +119,7 @@ def test_a_run_that_has_learnt_nothing_is_replaced() -> None:
     dead_run(Path("run"))
     (Path("run") / ".policy.x.tmp").write_bytes(b"half")
     before = RunDirectory.open("run").manifest.id
-    run = declare().train("run", seed=5, quiet=True)
+    run = train(seed=5)
     assert run.info()["id"] != before
     assert run.info()["seed"] == 5
     assert not (run.path / ".policy.x.tmp").exists()
@@ -131,7 +131,7 @@ def test_what_a_process_left_before_its_manifest_is_replaced() -> None:
     Path("run").mkdir()
     lock = Lock(Path("run"))
     lock.release()
-    assert declare().train("run", quiet=True).path.is_dir()
+    assert train().path.is_dir()
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "policies/mine.onnx", "films/a.gif", "report.html"])
@@ -142,7 +142,7 @@ def test_a_file_that_is_not_ours_keeps_all_as_it_is(name: str) -> None:
     file.write_text("years of work")
     before = {p: p.read_bytes() for p in Path("run").rglob("*") if p.is_file()}
     with pytest.raises(RunError, match=r"run holds .*nothing there is replaced"):
-        declare().train("run", quiet=True)
+        train()
     assert {p: p.read_bytes() for p in Path("run").rglob("*") if p.is_file()} == before
 
 
@@ -152,7 +152,7 @@ def test_links_are_not_followed() -> None:
     Path("elsewhere/weights.safetensors").write_text("years of work")
     (Path("run") / "starts").symlink_to(Path("elsewhere").absolute())
     with pytest.raises(RunError, match="run/starts is a link to"):
-        declare().train("run", quiet=True)
+        train()
     assert Path("elsewhere/weights.safetensors").exists()
 
 
@@ -161,7 +161,7 @@ def test_a_lock_of_another_program_is_left_alone(content: str) -> None:
     Path("run").mkdir()
     Path("run/other.lock").write_text(content)
     with pytest.raises(RunError, match="not an empty directory"):
-        declare().train("run", quiet=True)
+        train()
     assert [p.name for p in Path("run").iterdir()] == ["other.lock"]
 
 
@@ -185,17 +185,17 @@ def test_a_living_process_keeps_its_run_and_is_named() -> None:
         assert process.stdout.readline() == "held\n"
         for resume in (False, True):
             with pytest.raises(RunError, match=f"trained by process {process.pid};"):
-                declare().train("run", resume=resume, quiet=True)
+                train(resume=resume)
         process.kill()
     assert Path("run/run.json").read_bytes() == before
-    assert declare().train("run", quiet=True).path.is_dir()
+    assert train().path.is_dir()
 
 
 def test_a_system_without_locks_replaces_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     dead_run(Path("run"))
     monkeypatch.setattr("skillweave.runs.lock.fcntl", None)
     with pytest.raises(RunError, match="has no locks that show whether a process uses it"):
-        declare().train("run", quiet=True)
+        train()
 
 
 # Runs that are overwritten
@@ -211,36 +211,32 @@ def entries(path: str) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("plain", [False, True])
 def test_a_run_is_overwritten_where_that_is_asked(plain: bool) -> None:
-    def train(path: str, **how: Any) -> None:
+    def again(path: str, **how: Any) -> None:
         if plain:
             sw.train_agent(CARTPOLE, ON, 64, path, quiet=True, **how)
         else:
-            declare().train(path, quiet=True, **how)
+            train(path, **how)
 
-    old = declare().train("run", quiet=True)
+    old = train()
     old.evaluate(2, save=True)
     old.log_calls(100)
     own = {"notes.txt": b"", "policies/mine.onnx": b"years of work"}
     for name, content in own.items():
         Path("run", name).write_bytes(content)
     with pytest.raises(RunError, match="overwrite=True"):
-        train("run", seed=1)
+        again("run", seed=1)
     for path in ("run", "other"):
-        train(path, seed=1, overwrite=True)
+        again(path, seed=1, overwrite=True)
     assert entries("run") == entries("other") | own
 
 
-def test_an_unfinished_run_is_overwritten_and_a_run_may_start_from_itself(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    with monkeypatch.context() as patched:
-        interrupt_at_checkpoint(patched, 1)
-        with pytest.raises(KeyboardInterrupt):
-            declare(640).train("run", checkpoint_every=64, quiet=True)
-    Path("plain.py").write_text(RECIPE)
+def test_an_unfinished_run_is_overwritten_and_a_run_may_start_from_itself() -> None:
+    with interrupted(1):
+        declare(640).train("run", checkpoint_every=64, quiet=True)
+    Path("plain.py").write_text(plain_recipe(64))
     assert main(["train", "plain.py", "-o", "run", "--overwrite", "--evaluate", "0"]) == 0
     with pytest.warns(UserWarning, match="the reward of skill 'left' has changed"):
-        run = declare().train("run", overwrite=True, start_from="run", quiet=True)
+        run = train(overwrite=True, start_from="run")
     assert sw.load(run.path, declare()).info()["seed"] == 0
 
 
@@ -265,11 +261,9 @@ def test_other_directories_are_not_overwritten(how: dict[str, Any], says: str) -
 # What is said of runs that are kept
 
 
-def test_a_resumable_run_is_kept_and_the_line_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patched:
-        interrupt_at_checkpoint(patched, 1)
-        with pytest.raises(KeyboardInterrupt) as stop:
-            declare(640).train("my run", seed=3, checkpoint_every=64, quiet=True)
+def test_a_resumable_run_is_kept_and_the_line_is_said() -> None:
+    with interrupted(1) as stop:
+        declare(640).train("my run", seed=3, checkpoint_every=64, quiet=True)
     line = 'hierarchy.train("my run", seed=3, resume=True)'
     assert str(stop.value).endswith(f"Continue: {line}")
     with pytest.raises(RunError, match=re.escape(f"Continue it: {line}")):
@@ -287,16 +281,16 @@ def test_a_finished_run_is_kept_and_the_lines_are_said() -> None:
     assert 'train_agent(env, algorithm, steps, "run", resume=True)' in str(caught.value)
     with pytest.raises(RunError, match=r'agent\.train\("run", resume=True\)'):
         Agent("CartPole-v1", ON, 64).train("run", quiet=True)
-    declare().train("flat", flat=True, quiet=True)
+    train("flat", flat=True)
     with pytest.raises(RunError, match=r'hierarchy\.train\("flat", resume=True, flat=True'):
-        declare().train("flat", flat=True, quiet=True)
+        train("flat", flat=True)
 
 
 # The command line
 
 
 def test_the_command_line_keeps_the_same_rule(capsys, monkeypatch: pytest.MonkeyPatch) -> None:
-    Path("plain.py").write_text(RECIPE)
+    Path("plain.py").write_text(plain_recipe(64))
     train = ["train", "plain.py", "--evaluate", "0", "--quiet"]
     for number in (1, 2):
         assert main(train) == 0
@@ -319,9 +313,9 @@ def test_the_command_line_keeps_the_same_rule(capsys, monkeypatch: pytest.Monkey
 def test_no_handle_stays_open_and_the_caller_is_forgotten() -> None:
     opened = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").exists() else 0
     main(["train", "nowhere.py"])
-    declare().train("run", quiet=True)
+    train()
     for _ in range(2):
         with pytest.raises(RunError, match=r"hierarchy\.train\("):
-            declare().train("run", quiet=True)
+            train()
     if opened:
         assert len(os.listdir("/proc/self/fd")) <= opened + 1

@@ -16,6 +16,14 @@ from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import TRACKERS, make_trackers, track_film, trackers_of
 
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+
+def events_in(folder: Path) -> Any:
+    """What TensorBoard shows of a folder."""
+    module = "tensorboard.backend.event_processing.event_accumulator"
+    return pytest.importorskip(module).EventAccumulator(str(folder)).Reload()
+
 
 @pytest.fixture
 def run(tmp_path: Path) -> RunDirectory:
@@ -63,11 +71,7 @@ def test_a_missing_package_is_said_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_tensorboard_gets_every_scalar_over_environment_steps(run: RunDirectory) -> None:
-    pytest.importorskip("tensorboard")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     (tracker,) = make_trackers(("tensorboard",), run)
     tracker.stage("landing", 1000)
     tracker.tick("landing", 128, 0.5, {"return": 1.5, "kl": 0.25})
@@ -75,17 +79,13 @@ def test_tensorboard_gets_every_scalar_over_environment_steps(run: RunDirectory)
     tracker.done("landing", 256, 1.0, {"return": 2.5})
     tracker.close()
     assert list((run.path / "tensorboard/landing").glob("events.out.tfevents.*"))
-    events = EventAccumulator(str(run.path / "tensorboard/landing")).Reload()
+    events = events_in(run.path / "tensorboard/landing")
     assert set(events.Tags()["scalars"]) == {"landing/return", "landing/kl"}
     points = [(e.step, e.value) for e in events.Scalars("landing/return")]
     assert points == [(128, 1.5), (256, 2.5)]
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_after_a_resume_tensorboard_shows_each_step_of_each_stage_once(run: RunDirectory) -> None:
-    pytest.importorskip("tensorboard")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     (killed,) = make_trackers(("tensorboard",), run)
     for steps in (100, 200, 300):  # the latest checkpoint is of step 100
         killed.tick("landing", steps, 1.0, {"return": 1.0})
@@ -99,7 +99,7 @@ def test_after_a_resume_tensorboard_shows_each_step_of_each_stage_once(run: RunD
     resumed.close()
     shown = {}
     for stage in ("landing", "selector"):
-        events = EventAccumulator(str(run.path / "tensorboard" / stage)).Reload()
+        events = events_in(run.path / "tensorboard" / stage)
         shown[stage] = [(e.step, e.value) for e in events.Scalars(f"{stage}/return")]
     assert shown["landing"] == [(100, 1.0), (200, 1.0), (300, 1.0)]
     assert shown["selector"] == [(100, 1.0), (200, 2.0), (300, 2.0)]
@@ -121,23 +121,25 @@ def test_a_resumed_run_goes_on_in_the_same_run_of_wandb(
     assert first["resume"] == again["resume"] == "allow"
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_saved_evaluation_draws_what_each_skill_did(run: RunDirectory) -> None:
-    pytest.importorskip("tensorboard")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+@pytest.fixture
+def tracked(run: RunDirectory) -> RunDirectory:
+    """A finished run of 700 steps that TensorBoard shows."""
+    run.manifest.track = ("tensorboard",)
+    run.manifest.stages = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
+    return run
 
+
+def test_a_saved_evaluation_draws_what_each_skill_did(tracked: RunDirectory) -> None:
     from skillweave.training.evaluation import Evaluation
     from skillweave.training.evaluation_file import save_evaluation
     from skillweave.training.skill_report import SkillReport
 
     land = SkillReport(steps=30, calls=10, succeeded=4, ended={}, return_sum=None)
     hover = SkillReport(steps=10, calls=2, succeeded=None, ended={}, return_sum=None)
-    run.manifest.track = ("tensorboard",)
-    run.manifest.stages = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
     for returns in ((1.0, 1.0), (1.0, 2.0)):  # the later one takes the place of the first
         found = Evaluation(returns, (20, 20), None, {"land": land, "hover": hover})
-        save_evaluation(run, found, 0, True)
-    events = EventAccumulator(str(run.path / "tensorboard/evaluation")).Reload()
+        save_evaluation(tracked, found, 0, True)
+    events = events_in(tracked.path / "tensorboard/evaluation")
     shown = {}
     for tag in events.Tags()["scalars"]:
         (point,) = events.Scalars(tag)
@@ -155,17 +157,11 @@ def gif(path: Path) -> Path:
     return path
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_tensorboard_shows_a_film(run: RunDirectory) -> None:
-    pytest.importorskip("tensorboard")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    run.manifest.track = ("tensorboard",)
-    run.manifest.stages = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
-    film = gif(run.path / "hierarchy.gif")
-    track_film(run, film)
-    track_film(run, run.path / "other.mp4")  # it cannot show those, and says nothing
-    events = EventAccumulator(str(run.path / "tensorboard/film")).Reload()
+def test_tensorboard_shows_a_film(tracked: RunDirectory) -> None:
+    film = gif(tracked.path / "hierarchy.gif")
+    track_film(tracked, film)
+    track_film(tracked, tracked.path / "other.mp4")  # it cannot show those, and says nothing
+    events = events_in(tracked.path / "tensorboard/film")
     assert events.Tags()["images"] == ["hierarchy"]
     (image,) = events.Images("hierarchy")
     assert (image.step, image.width, image.height) == (700, 3, 2)
