@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from skills.mapped_models import ACTION, CASES, SPACE, observations, one
+from test_networks import compare
 
 import skillweave as sw
 from skillweave.api.player import Player
@@ -22,24 +23,18 @@ pytest.importorskip("stable_baselines3")
 torch.set_num_threads(1)
 
 
-def compare(policy: Any, folder: Path, code: Any) -> None:
-    """Let a player and the runner act in episodes of 7 and more steps."""
-    player, runner, told = Player(policy), Runner(folder, code), []
-    for i, obs in enumerate(observations(1, 40, seed=4)):
-        if i in (7, 20):
-            player.reset(), runner.reset()
-        action = player.act(one(obs, 0))
-        np.testing.assert_allclose(runner.act(one(obs, 0)), action, atol=1e-5)
-        told.append(np.round(action, 3))
-    assert len(np.unique(told)) > 3
+def exported(policy: Any, folder: Path) -> None:
+    export = write_export(folder, policy, "robot")
+    seen = [one(obs, 0) for obs in observations(1, 40, seed=4)]
+    told = compare(policy, folder, seen, code=export.functions, rtol=1e-7)
+    assert len(np.unique(np.round(told, 3))) > 3
 
 
 @pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", CASES)
 def test_the_runner_applies_the_mapping(name: str, tmp_path: Path) -> None:
     policy = CASES[name](tmp_path).policy.bind(SPACE, ACTION, "it")
-    export = write_export(tmp_path / "out", policy, "robot")
-    compare(policy, tmp_path / "out", export.functions)
+    exported(policy, tmp_path / "out")
 
 
 class Parts(torch.nn.Module):
@@ -65,8 +60,7 @@ def program(folder: Path) -> Any:
 @pytest.mark.parametrize("make", [program, lambda folder: sw.from_torch(Parts())])
 def test_a_module_is_exported_as_it_is(make: Any, tmp_path: Path) -> None:
     policy = make(tmp_path).bind(SPACE, ACTION, "it")
-    write_export(tmp_path / "out", policy, "robot")
-    compare(policy, tmp_path / "out", {})
+    exported(policy, tmp_path / "out")
     player, loaded = Player(policy), Player(sw.load_policy(tmp_path / "out"))
     for obs in observations(1, 5):
         action = player.act(one(obs, 0))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from hub_server import go_to, serve
+from playing import episode
 from reference_calls import Left, Right, T, Zigzag, shy
 from skills.foreign_models import onnx_file
 from skills.mapped_models import ACTION, CASES, SPACE, observations, onnx_model, weights
@@ -173,16 +174,10 @@ HIERARCHIES: dict[str, Any] = {
 
 def episodes(policy: Policy, n: int) -> list[tuple[str, int]]:
     """Play whole episodes; return the names of the skills that acted, and the actions."""
-    env, player, found = LongWalk(), Player(policy), []
-    for episode in range(n):
-        obs, info = env.reset(seed=episode)
-        player.reset()
-        reward, over = 0.0, False
-        while not over:
-            action = player.act(obs, reward=reward, info=info)
+    player, found = Player(policy), []
+    for seed in range(n):
+        for (action,) in episode(LongWalk(), player, seed=seed):
             found.append((policy.acts(player.memory), int(action)))  # type: ignore[attr-defined]
-            obs, reward, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
     return found
 
 

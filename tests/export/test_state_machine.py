@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from playing import episode
 from reference_calls import POSITION, TAG, Counter, Left, Right, T, Walk, Zigzag, scripted, shy
 from test_networks import agent
 from toys import skills_of
@@ -143,19 +144,13 @@ POLICIES: dict[str, Any] = {
 
 def played(policy: HierarchyPolicy, runner: Runner, episodes: int) -> list[tuple[int, int, bool]]:
     """Whole episodes, in which both act alike; of each step the skill, the action, a decision."""
-    env, player, told = LongWalk(), Player(policy), []
-    for episode in range(episodes):
-        obs, info = env.reset(seed=episode)
-        player.reset(), runner.reset()
-        reward, over = 0.0, False
-        while not over:
-            action = player.act(obs, reward=reward, info=info)
-            assert runner.act(obs, reward=reward, info=info) == action
+    player, told = Player(policy), []
+    for seed in range(episodes):
+        for action, theirs in episode(LongWalk(), player, runner, seed=seed):
+            assert theirs == action
             memory = player.memory
             assert runner.memory["skill"][0] == memory["skill"][0]
             told.append((int(memory["skill"][0]), int(action), memory["elapsed"][0] == 0))
-            obs, reward, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
     return told
 
 
