@@ -246,6 +246,8 @@ def test_a_pickle_that_is_huge_when_written_out_is_refused(tmp_path):
     path = write_program(tmp_path / "x.pt", b"\x80\x02(" + b"N" * 600_000 + b"t.")
     with pytest.raises(RunError, match="more than 500,000 operations"):
         read_torch_pickle(path)
+    with pytest.raises(RunError, match="refused: the pickle doubles an object"):
+        read_torch_pickle(write_program(tmp_path / "x.pt", b"\x80\x02]2a."))
 
 
 def test_sizes_that_a_file_declares_are_looked_at_before_it_is_read(tmp_path):
