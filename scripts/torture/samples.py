@@ -42,12 +42,11 @@ from skillweave import (
     Skill,
     from_onnx,
 )
-from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api import Agent, Run, train_agent
 from skillweave.cli import commands, execute
+from skillweave.compat.agilerl import agents
 from skillweave.compat.agilerl_files import convert
-from skillweave.compat.single_agent import load_agent
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory
@@ -173,8 +172,9 @@ def flat_weights(folder: Path, changed: str) -> Play:
 def converted(folder: Path, changed: str) -> Play:
     """Convert a checkpoint of AgileRL's, and load the result."""
     convert(folder / "old.pt", folder / "new.safetensors")
-    algorithm, state, about = load_agent(folder / "new.safetensors", Seeds(0))
-    return plays(AgentPolicy.of(algorithm, state)) | {"about": repr(about)}
+    agent = agents.PPO.load(folder / "new.safetensors")
+    about = agent.scores, agent.fitness, agent.steps, agent.index
+    return plays(AgentPolicy.of(agent.learner, agent.member.state)) | {"about": repr(about)}
 
 
 def onnx_skill(folder: Path, changed: str) -> Play:

@@ -23,7 +23,6 @@ from skillweave.cli.output import Result, print_line, run_words, save_score
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.sweep import sweep
 from skillweave.cli.training import resume, train
-from skillweave.compat.agilerl_files import convert
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy.recorded import calls_of
 from skillweave.hierarchy.weights import HierarchyHeader, open_weights
@@ -361,6 +360,9 @@ def _import_agilerl(command: commands.ImportAgilerl) -> Result:
             "by an unpickler that admits only tensors, numbers and plain containers; if you trust "
             "where it comes from nevertheless, say so: --trust"
         )
+    # Here: AgileRL's names come with its ids of environments, and its way with wandb.
+    from skillweave.compat.agilerl_files import convert
+
     out = command.out or command.file.with_suffix(".safetensors")
     algo = convert(command.file, out)
     text = f"wrote {out}: a {algo} agent, for {algo}.load of skillweave.compat.agilerl"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
 
@@ -15,19 +14,17 @@ import torch
 from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.config import DQN, PPO, TD3
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.compat.agilerl.agent import Agent, network_of, observations_of
+from skillweave.compat.agilerl.agents import DQN, KINDS, PPO, TD3
 from skillweave.compat.pickles import read_torch_pickle
-from skillweave.compat.single_agent import save_agent
 from skillweave.errors import RunError, SkillweaveError
-from skillweave.networks.config import CNN, Network
-from skillweave.networks.stacked import Views
+from skillweave.evolution.stacks import Member
+from skillweave.networks.config import Network
 from skillweave.policies.files import shown
 from skillweave.schema import AtLeastOne, Check, fit
 
-_KINDS: dict[str, Any] = {"PPO": PPO, "DQN": DQN, "DDPG": TD3, "TD3": TD3}
 _OUTPUTS = {"PPO": "Softmax", "DQN": None, "DDPG": "Tanh", "TD3": "Tanh"}
-ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "SiLU": "silu", "GELU": "gelu"}
 _LAYER = re.compile(r"(linear_layer|layer_norm)_(\d+|output)\.(weight|bias)$")
 
 
@@ -42,11 +39,11 @@ def convert(path: Path, out: Path) -> str:
     """
     data = read_torch_pickle(path)
     algo: Any = data.get("algo") if isinstance(data, dict) else None
-    known = isinstance(algo, str) and algo in _KINDS
+    known = isinstance(algo, str) and algo in _OUTPUTS
     if not known or "actor_state_dict" not in data or "actor_init_dict" not in data:
         raise RunError(
             f"{path} holds no agent that can be converted (algorithm {shown(algo)}): it must be a "
-            f"checkpoint of AgileRL 0.1 or 1.0 of {', '.join(_KINDS)}"
+            f"checkpoint of AgileRL 0.1 or 1.0 of {', '.join(_OUTPUTS)}"
         )
     fit(_Checkpoint, data, str(path))
     init = data["actor_init_dict"]
@@ -58,17 +55,14 @@ def convert(path: Path, out: Path) -> str:
             "be converted: no native policy computes the same as others"
         )
     try:
-        algorithm, state = _agent(algo, data)
-        past = {k: [float(x) for x in data.get(k, ())] for k in ("scores", "fitness")}
-        steps = [int(x) for x in data.get("steps", (0,))]
+        agent = _agent(KINDS[algo], data)
     except SkillweaveError as error:
         raise RunError(f"{path}: {error}") from error
     except (LookupError, TypeError, ValueError, ArithmeticError, RuntimeError) as error:
         reason = f"{type(error).__name__}: {str(error)[:300]}"
         raise RunError(f"{path}: its networks are not as it describes: {reason}") from error
-    about = {"algo": algo, **past, "steps": steps, "index": data.get("index", 0), "mut": None}
-    save_agent(out, algorithm, state, about)
-    return str(algo)
+    agent.saveCheckpoint(out)
+    return agent.algo
 
 
 _MOST_UNITS = 10**6
@@ -111,97 +105,50 @@ class _Checkpoint(TypedDict):
     policy_freq: NotRequired[AtLeastOne]
 
 
-def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
-    kind = _KINDS[algo]
+def _agent(kind: Any, data: Mapping[str, Any]) -> Agent:
+    """Return the agent that a checkpoint describes."""
     actor = data["actor_init_dict"]
     critics = [data[k] for k in ("critic_state_dict", "critic_1_state_dict") if k in data]
     critics += [data[k] for k in ("critic_2_state_dict",) if k in data]
-    names = {f.name for f in fields(kind)}
-    known = {k: v for k, v in data.items() if k in names and type(v) in (int, float, bool)}
     rate = data.get("lr", data.get("lr_critic", 1e-3))
-    config: dict[str, Any] = {**known, "learning_rate": float(rate), "network": _mlp(actor)}
-    if kind is PPO:
-        config |= {"learning_rate_schedule": "constant", "num_envs": 1, "n_steps": 2**31}
-        config["min_advantage_std"] = 0.0  # AgileRL has no such limit
-    config["normalize_obs"] = False  # AgileRL does not
-    if "learn_step" in data and kind is not PPO:
-        config["update_ratio"] = 1.0 / data["learn_step"]
-    if kind is TD3:
-        config |= {"twin": algo == "TD3", "n_step": 1, "exploration_noise": 0.1}
-        config |= {"action_l2": 0.0, "policy_delay": int(data.get("policy_freq", 2))}
-        config["actor_rate"] = float(data.get("lr_actor", rate)) / float(rate)
+    given = {k: v for k, v in data.items() if type(v) in (int, float, bool)}
+    given |= {"lr": float(rate), "lr_critic": float(rate)}
+    settings: dict[str, Any] = {"network": _mlp(actor)}
+    outputs = int(actor["num_outputs"])
+    actions: gym.Space[Any] = gym.spaces.Discrete(outputs)
     if kind is not DQN:
-        config["critic"] = _mlp(data.get("critic_init_dict") or data["critic_1_init_dict"])
-    algorithm: Any = make_algorithm(kind(**config), *_spaces(kind, data))
-    acting = "q" if kind is DQN else "actor"
+        settings["critic"] = _mlp(data.get("critic_init_dict") or data["critic_1_init_dict"])
+    if issubclass(kind, TD3):
+        settings["exploration_noise"] = 0.1
+        settings["actor_rate"] = float(data.get("lr_actor", rate)) / float(rate)
+        low, high = (np.broadcast_to(data[k], outputs) for k in ("min_action", "max_action"))
+        actions = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32))
+    spaces = observations_of(actor["num_inputs"], data.get("one_hot"), actor), actions
+    algorithm: Any = make_algorithm(kind.config_of(given, **settings), *spaces)
     shapes = algorithm.layout.shapes
-    weights = _named(shapes, acting, data["actor_state_dict"])
+    weights = _named(shapes, "q" if kind is DQN else "actor", data["actor_state_dict"])
     if kind is PPO:
         weights |= _named(shapes, "critic", critics[0])
-    apart = critics if kind is TD3 else []
+    apart = critics if issubclass(kind, TD3) else []
     valued = [_named(algorithm.critics.layout.shapes, "critic", critic) for critic in apart]
     state = algorithm.init([Seeds(0)])  # not before: the file has weights of the described sizes
-    _fill(algorithm.layout.views(state.params), weights)
-    if kind is not PPO:
-        state.target.copy_(state.params)
+    algorithm.set_weights(state, weights)
     for i, named in enumerate(valued):
         for flat in (state.critic, state.critic_target):
-            _fill(algorithm.critics.layout.views(flat[:, i]), named)
-    return algorithm, state
-
-
-def _spaces(kind: type, data: Mapping[str, Any]) -> tuple[gym.Space[Any], gym.Space[Any]]:
-    init = data["actor_init_dict"]
-    outputs = int(init["num_outputs"])
-    seen = observations_of(init["num_inputs"], data.get("one_hot"))
-    if kind is not TD3:
-        return seen, gym.spaces.Discrete(outputs)
-    low, high = (
-        np.broadcast_to(data[k], outputs).astype(np.float32) for k in ("min_action", "max_action")
+            for name, view in algorithm.critics.layout.views(flat[:, i]).items():
+                view[0].copy_(named[name])
+    agent: Agent = kind.__new__(kind)
+    agent.take(Member(0, algorithm.config, state), spaces, Seeds(0))
+    agent.scores, agent.fitness = (
+        [float(x) for x in data.get(k, ())] for k in ("scores", "fitness")
     )
-    return seen, gym.spaces.Box(low, high)
+    agent.steps = [int(x) for x in data.get("steps", (0,))]
+    agent.index = data.get("index", 0)
+    return agent
 
 
 def _mlp(init: Mapping[str, Any]) -> Network:
     return network_of({"arch": "mlp", **init})  # an ``*_init_dict`` leaves it unsaid
-
-
-def observations_of(
-    size: Any, one_hot: bool | None, net_config: Mapping[str, Any] | None = None
-) -> gym.Space[Any]:
-    """Return the observation space of states of this size, for a network of this description."""
-    shape = [int(n) for n in np.atleast_1d(size)]
-    described = net_config or {}
-    if one_hot:
-        return gym.spaces.Discrete(shape[0])
-    if described.get("arch") != "cnn":
-        return gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
-    if described.get("normalize", True):
-        return gym.spaces.Box(0, 255, shape, np.uint8)
-    return gym.spaces.Box(0.0, 1.0, shape, np.float32)
-
-
-def network_of(described: Mapping[str, Any], usual: str | None = None) -> Network:
-    """Return the network that a ``net_config`` of AgileRL describes.
-
-    Raises:
-        RunError: a part is missing or unknown.
-    """
-    name = described.get("mlp_activation") or described.get("activation") or usual
-    known = described.get("arch") in ("mlp", "cnn") and name in ACTIVATIONS
-    if not known or "hidden_size" not in described:
-        raise RunError(
-            f"a network is described by {shown(dict(described), 500)}; it must have a hidden_size, "
-            f"arch be 'mlp' or 'cnn', and its activation be one of {', '.join(ACTIVATIONS)}"
-        )
-    sizes = [tuple(described.get(f"{k}_size", ())) for k in ("channel", "kernel", "stride")]
-    cnn = CNN("plain", *sizes) if sizes[0] else None
-    hidden = described["hidden_size"]
-    layer_norm = bool(described.get("layer_norm"))
-    activation = ACTIVATIONS[str(name)]
-    planes: Any = None if cnn is None else "first"  # the layout of all images in AgileRL
-    widths = tuple(int(n) for n in hidden)
-    return Network(widths, activation, layer_norm, cnn, planes=planes)  # type: ignore[arg-type]
 
 
 def _named(
@@ -238,8 +185,3 @@ def _named(
     if left := sorted(set(expected) - set(named)):
         raise RunError(f"there are no weights for {', '.join(left)}")
     return named
-
-
-def _fill(views: Views, weights: Mapping[str, Tensor]) -> None:
-    for name, value in weights.items():
-        views[name][0].copy_(value)

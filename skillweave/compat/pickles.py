@@ -33,7 +33,6 @@ LARGEST = 2**30
 """Bytes of everything in the file."""
 _INTO = {"APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD"}
 """Operations that put something into an object on the stack."""
-_MARK = -1
 
 
 _STORAGES = {
@@ -108,7 +107,7 @@ def read_torch_pickle(path: Path) -> Any:
             program = file.read(name)
             check_program(program)
             prefix = name.removesuffix("data.pkl")
-            return _Plain()(_Reader(io.BytesIO(program), file, prefix).load())[0]
+            return _plain(_Reader(io.BytesIO(program), file, prefix).load())
     except zipfile.BadZipFile as error:
         reason = shortened(str(error))  # it may quote much of the file
         raise RunError(
@@ -138,13 +137,23 @@ def check_sizes(file: zipfile.ZipFile, size: int, program: str) -> None:
         )
 
 
-def check_program(program: bytes) -> None:
-    """Raise where a pickle's program is too long, or its objects are nested too deep.
+class _Weight:
+    """What is known of an object of a pickle before it is made."""
 
-    It is run with the depth of every object in place of the object.
+    def __init__(self) -> None:
+        self.depth = 0
+        self.size = 1  # in objects, if nothing were shared
+        self.taken = False  # another object holds it, so it may not grow any more
+
+
+def check_program(program: bytes) -> None:
+    """Raise where a pickle's program is too long, or what it makes too deep, endless or too large.
+
+    It is run with the weight of every object in place of the object.
     """
-    stack: list[int] = []
-    memo: dict[Any, int] = {}
+    stack: list[_Weight] = []
+    memo: dict[Any, _Weight] = {}
+    mark = _Weight()
     for step, (operation, argument, _) in enumerate(pickletools.genops(program)):
         name = operation.name
         operands = operation.stack_before
@@ -157,51 +166,34 @@ def check_program(program: bytes) -> None:
             stack.append(memo[argument])
             continue
         if name == "MARK":
-            stack.append(_MARK)
+            stack.append(mark)
             continue
+        if name == "DUP":  # no pickle of Python's has it
+            raise RunError("refused: the pickle doubles an object")
         inner = []
         if pickletools.markobject in operands:
-            while (depth := stack.pop()) != _MARK:
-                inner.append(depth)
+            while (weight := stack.pop()) is not mark:
+                inner.append(weight)
             operands = operands[: operands.index(pickletools.markobject)]
         inner += [stack.pop() for _ in operands]
-        outer = inner.pop() if name in _INTO else 0
-        depth = max(outer, max(inner, default=-1) + 1)
-        if depth > DEEPEST:
+        outer = inner.pop() if name in _INTO else _Weight()
+        for part in inner:
+            part.taken = True
+            outer.depth = max(outer.depth, part.depth + 1)
+            outer.size += part.size
+        if outer.depth > DEEPEST or (inner and outer.taken):  # it would hold itself, endlessly
             raise RunError(f"its pickle nests objects more than {DEEPEST} deep")
-        stack += [depth] * len(operation.stack_after)
-
-
-class _Plain:
-    """A conversion of a pickle's objects to plain tensors, Python numbers and containers."""
-
-    def __init__(self) -> None:
-        self._results: dict[int, tuple[Any, int]] = {}
-
-    def __call__(self, data: Any, depth: int = 0) -> tuple[Any, int]:
-        """Return an object in plain objects, and their number if nothing were shared."""
-        if id(data) in self._results:
-            return self._results[id(data)]
-        if depth > DEEPEST:  # lists and dicts can be put into one another later, even in a circle
-            raise RunError(f"its pickle nests objects more than {DEEPEST} deep")
-        inner: list[Any] = []
-        if isinstance(data, dict):
-            inner = [part for item in data.items() for part in item]
-        elif isinstance(data, list | tuple | set | frozenset):
-            inner = list(data)
-        parts = [self(part, depth + 1) for part in inner]
-        size = 1 + sum(n for _, n in parts)
-        if size > MOST_STEPS:
+        if outer.size > MOST_STEPS:
             raise RunError(f"its pickle holds more than {MOST_STEPS:,} objects")
-        self._results[id(data)] = _rebuilt(data, [value for value, _ in parts]), size
-        return self._results[id(data)]
+        stack += [outer] * len(operation.stack_after)
 
 
-def _rebuilt(data: Any, inner: list[Any]) -> Any:
+def _plain(data: Any) -> Any:
+    """Return a pickle's objects as plain tensors, Python numbers and containers."""
     if isinstance(data, dict):
-        return dict(zip(inner[::2], inner[1::2], strict=True))
+        return {_plain(key): _plain(value) for key, value in data.items()}
     if isinstance(data, list | tuple | set | frozenset):
-        return type(data)(inner)
+        return type(data)(map(_plain, data))
     if isinstance(data, _Held):
         return data.tensor
     if isinstance(data, _Array):

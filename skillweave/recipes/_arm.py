@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -10,6 +11,7 @@ import numpy as np
 
 from skillweave import EnvSpec
 from skillweave.errors import needs_extra
+from skillweave.recipes._specs import named
 from skillweave.types import Array
 
 NEAR = 0.05
@@ -161,9 +163,5 @@ def make(disturbances: Disturbances = CALM, render_mode: str | None = None) -> g
 
 def spec(disturbances: Disturbances = CALM) -> EnvSpec:
     """Return the task, for ``Hierarchy(env=...)``."""
-
-    def arm(render_mode: str | None = None) -> gym.Env[Any, Any]:
-        return make(disturbances, render_mode)
-
-    arm.__name__ = "PickAndPlace" if disturbances == CALM else "PickAndPlaceDisturbed"
-    return EnvSpec(arm)
+    name = "PickAndPlace" if disturbances == CALM else "PickAndPlaceDisturbed"
+    return named(name, partial(make, disturbances))

@@ -12,6 +12,7 @@ import numpy as np
 from skillweave import EnvSpec, envpool
 from skillweave.envs import PoolWrapper
 from skillweave.errors import DeclarationError, needs_extra
+from skillweave.recipes._specs import named
 from skillweave.types import Array
 
 ROUND = 1000.0
@@ -185,10 +186,6 @@ def many(num_envs: int, threads: int, seed: int, points: tuple[float, ...]) -> P
 
 def spec(points: tuple[float, ...] = (2.0, -2.0)) -> EnvSpec:
     """Return the half-cheetah with a patrol of these points, for ``Hierarchy(env=...)``."""
-
-    def cheetah(render_mode: str | None = None) -> gym.Env[Any, Any]:
-        return make(points, render_mode)
-
     # The name has the scale of x, so that runs with another scale are not taken for these.
-    cheetah.__name__ = f"Shuttle({', '.join(f'{p:g}' for p in points)}; log x)"
-    return EnvSpec(cheetah, pool=partial(many, points=points))
+    name = f"Shuttle({', '.join(f'{p:g}' for p in points)}; log x)"
+    return named(name, partial(make, points), partial(many, points=points))

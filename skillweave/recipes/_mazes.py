@@ -12,6 +12,7 @@ import numpy as np
 from skillweave import EnvSpec, envpool
 from skillweave.envs import PoolWrapper
 from skillweave.errors import DeclarationError, needs_extra
+from skillweave.recipes._specs import named
 from skillweave.types import Array
 
 MAZES = {
@@ -130,12 +131,7 @@ def spec(maze: str = "large") -> EnvSpec:
     """
     if maze not in MAZES:
         raise DeclarationError(f"no maze {maze!r}; there are: {', '.join(MAZES)}")
-
-    def ball(render_mode: str | None = None) -> gym.Env[Any, Any]:
-        return make(maze, render_mode)
-
-    ball.__name__ = f"Maze({maze})"
-    return EnvSpec(ball, pool=partial(many, maze))
+    return named(f"Maze({maze})", partial(make, maze), partial(many, maze))
 
 
 WAYS = {"north": (-1, 0), "east": (0, 1), "south": (1, 0), "west": (0, -1)}

@@ -17,6 +17,7 @@ import numpy as np
 from skillweave import EnvSpec, envpool
 from skillweave.envs import PoolWrapper
 from skillweave.errors import DeclarationError
+from skillweave.recipes._specs import named
 from skillweave.types import Array
 
 LANDER = "LunarLander-v3"
@@ -24,9 +25,9 @@ EPISODE = 1000
 """Steps of an episode, at most: 20 seconds, as LunarLander's."""
 KINDS = ("left", "right", "hover", "land")
 """The kinds of legs of a mission."""
+LEFT, RIGHT, HOVER, LAND = range(4)
 LEGS = 3
 """The most legs that a mission has."""
-LAND = KINDS.index("land")
 POINTS = np.array([(-0.5, 0.75), (0.5, 0.75), (0.0, 0.6)])
 """Where left, right and hover are: x and y as the lander sees them."""
 HALF = np.array([(0.15, 0.15), (0.15, 0.15), (0.2, 0.2)])
@@ -102,10 +103,10 @@ class Progress:
         place = obs[:, :2]
         at = np.clip(leg, 0, LAND - 1)
         inside = (np.abs(place - POINTS[at]) <= HALF[at] + 1e-6).all(axis=1)
-        hovering = inside & (KINDS.index("hover") == leg)
+        hovering = inside & (leg == HOVER)
         held = np.where(hovering, self.held[ids] + 1, 0)
         rested = ended & (reward == RESTED)
-        done = (leg >= 0) & (leg < KINDS.index("hover")) & inside
+        done = (leg >= 0) & (leg < HOVER) & inside
         done |= held >= HOVER_STEPS
         done |= (leg == LAND) & rested & (np.abs(place[:, 0]) <= PAD)
         self.held[ids] = np.where(done, 0, held)
@@ -247,9 +248,5 @@ def spec(name: str, missions: Sequence[Sequence[str]], gusts: bool = False) -> E
     Args:
         name: the task's name in runs.
     """
-
-    def lander(render_mode: str | None = None) -> gym.Env[Any, Any]:
-        return make(missions, gusts, render_mode)
-
-    lander.__name__ = f"Lander({name})"
-    return EnvSpec(lander, pool=partial(many, missions, gusts))
+    how = missions, gusts
+    return named(f"Lander({name})", partial(make, *how), partial(many, *how))

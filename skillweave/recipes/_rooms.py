@@ -12,7 +12,8 @@ import numpy as np
 
 from skillweave import EnvSpec, envpool
 from skillweave.errors import DeclarationError, needs_extra
-from skillweave.types import Array
+from skillweave.recipes._specs import named
+from skillweave.types import Array, Memory, Memoryless
 
 SMALL = (
     "DoorKey-8x8",
@@ -100,15 +101,18 @@ def shut(cells: Array) -> Array:
 
 def at_open_door(obs: Array) -> Array:
     """Return whether the agent stands before an open door, (n,) bool."""
-    cells = ahead(obs)
-    at_door: Array = (cells[:, 0] == DOOR) & (cells[:, 2] == OPEN)
-    return at_door
+    return open_door(ahead(obs))
+
+
+def open_door(cells: Array) -> Array:
+    """Return whether a cell (n, 3) is an open door, (n,) bool."""
+    is_open: Array = (cells[:, 0] == DOOR) & (cells[:, 2] == OPEN)
+    return is_open
 
 
 def free(cells: Array) -> Array:
     """Return whether an agent can enter the cells (n, 3), (n,) bool."""
-    opened = (cells[:, 0] == DOOR) & (cells[:, 2] == OPEN)
-    can_enter: Array = _one_of(EMPTY, FLOOR, GOAL)[cells[:, 0]] | opened
+    can_enter: Array = _one_of(EMPTY, FLOOR, GOAL)[cells[:, 0]] | open_door(cells)
     return can_enter
 
 
@@ -125,6 +129,51 @@ def between_walls(obs: Array) -> Array:
     """Return whether walls are on the agent's left and right, as in a doorway, (n,) bool."""
     between: Array = (obs[:, 2, 6, 0] == WALL) & (obs[:, 4, 6, 0] == WALL)
     return between
+
+
+TURNS = 4
+"""It sees all four sides and keeps its direction; with one turn less it would walk in squares."""
+PACES = 5
+"""Steps after which it looks around again."""
+ENTERING = 3
+"""Steps before it first looks around: from a doorway it would not see much."""
+
+
+class LookAround(Memoryless):
+    """A policy that walks straight for some cells, looks to all four sides, and repeats that.
+
+    Its memory counts turns, and steps since the last one, because an observation shows only the
+    cells in front of the agent.
+    """
+
+    observation_space = SPACE
+    action_space = ACTIONS
+
+    def start(self, n: int) -> Memory:
+        """Start a memory: it goes some cells before it looks."""
+        return {"turns": np.full(n, TURNS), "paces": np.full(n, PACES - ENTERING)}
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Return turns to the right, once around; then steps straight on, around obstacles."""
+        turns = memory["turns"]
+        paces = memory["paces"]
+        again = (paces >= PACES) | ((paces > 0) & ~free(ahead(obs)))
+        turns = np.where(again, 0, turns)
+        paces = np.where(again, 0, paces)
+        looks = turns < TURNS
+        goes = free(ahead(obs))
+        only_left = free(obs[:, 2, 6]) & ~free(obs[:, 4, 6])
+        around = np.where(goes, FORWARD, np.where(only_left, LEFT, RIGHT))
+        after = {"turns": turns + looks, "paces": paces + (~looks & goes)}
+        return np.where(looks, RIGHT, around), after
 
 
 class Rooms(gym.Env[Any, Any]):
@@ -231,9 +280,4 @@ def spec(name: str = "small") -> EnvSpec:
     if name not in ROOMS:
         raise DeclarationError(f"no rooms {name!r}; there are: {', '.join(ROOMS)}")
     rooms = ROOMS[name]
-
-    def one(render_mode: str | None = None) -> gym.Env[Any, Any]:
-        return Rooms(rooms, render_mode)
-
-    one.__name__ = f"Rooms({name})"
-    return EnvSpec(one, pool=partial(RoomPool, rooms))
+    return named(f"Rooms({name})", partial(Rooms, rooms), partial(RoomPool, rooms))

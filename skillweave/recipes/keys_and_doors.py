@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from skillweave import PPO, Apart, Hierarchy, Network, Selection, Skill, Step, Together
-from skillweave.recipes._looking import LookAround
 from skillweave.recipes._rooms import (
     BALL,
     BOX,
@@ -32,6 +31,7 @@ from skillweave.recipes._rooms import (
     LOCKED,
     OPEN,
     TOGGLE,
+    LookAround,
     ahead,
     anywhere,
     at_open_door,
@@ -44,6 +44,7 @@ from skillweave.recipes._rooms import (
     spec,
     steps_to,
 )
+from skillweave.recipes._specs import given
 from skillweave.types import Array
 
 
@@ -269,11 +270,8 @@ def declare(rooms: str = "small", **how: Any) -> Hierarchy:
 
 def with_skills(rooms: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     """Return the hierarchy in these rooms with learnt skills, by name; only the selector learns."""
-    hierarchy = declare(rooms, **({"apart": replace(APART, selector_steps=1_500_000)} | how))
-    for skill in hierarchy.skills:
-        skill.policy = skills[skill.name]
-        skill.steps = None  # it is not trained
-    return hierarchy
+    how = {"apart": replace(APART, selector_steps=1_500_000)} | how
+    return given(declare(rooms, **how), skills)
 
 
 def going_on(rooms: str, **how: Any) -> Hierarchy:

@@ -23,7 +23,8 @@ import numpy as np
 
 from skillweave import PPO, Apart, Hierarchy, Network, Selection, Skill, Step, TrainDefaults
 from skillweave.errors import DeclarationError
-from skillweave.recipes._missions import HALF, KINDS, PAD, POINTS, spec
+from skillweave.recipes._missions import HALF, HOVER, KINDS, LEFT, PAD, POINTS, RIGHT, spec
+from skillweave.recipes._specs import given
 from skillweave.types import Array
 
 X = 0
@@ -115,8 +116,8 @@ class Hover(Flight):
     """It flies there, and stays for two seconds. With calls of 50 steps a leg took several, one
     after the other, which a selector hardly ever chose at random."""
     prize = 0.0
-    point = POINTS[KINDS.index("hover")]
-    half = HALF[KINDS.index("hover")]
+    point = POINTS[HOVER]
+    half = HALF[HOVER]
 
     def reward(self, step: Step) -> Array:
         """Return 1 less the deviation, 1 for a step in the box, −20 for an episode's end."""
@@ -129,23 +130,21 @@ class Hover(Flight):
 class GoLeft(Flight):
     """Fly to the point on the left, until it is reached."""
 
-    point = POINTS[KINDS.index("left")]
-    half = HALF[KINDS.index("left")]
+    point = POINTS[LEFT]
+    half = HALF[LEFT]
 
     def initiation(self, obs: Array) -> Array:
         """Return whether it is elsewhere: at the point a call would end at once."""
         return ~self.there(obs)
 
-    def termination(self, step: Step) -> Array:
-        """Return whether it is there."""
-        return self.success(step)
+    termination = Flight.success
 
 
 class GoRight(GoLeft):
     """Fly to the point on the right, until it is reached."""
 
-    point = POINTS[KINDS.index("right")]
-    half = HALF[KINDS.index("right")]
+    point = POINTS[RIGHT]
+    half = HALF[RIGHT]
 
 
 class Land(Skill):
@@ -235,11 +234,8 @@ def with_skills(
     mission: str, skills: Mapping[str, Any], gusts: bool = False, **how: Any
 ) -> Hierarchy:
     """Return the hierarchy on a mission with skills that are there already, by name."""
-    hierarchy = declare(mission, gusts, **{"apart": Apart(selector_steps=300_000)} | how)
-    for skill in hierarchy.skills:
-        skill.policy = skills[skill.name]
-        skill.steps = None  # it is not trained
-    return hierarchy
+    how = {"apart": Apart(selector_steps=300_000)} | how
+    return given(declare(mission, gusts, **how), skills)
 
 
 def by_leg(obs: Array) -> Array:
@@ -252,7 +248,7 @@ def by_leg(obs: Array) -> Array:
     skills = [GoLeft(), GoRight(), Hover(), Land()]
     may = np.stack([skill.initiation(obs) for skill in skills], axis=1)
     legs = obs[:, TO_DO].reshape(n, -1, len(KINDS)) > 0
-    kinds = np.full(n, KINDS.index("hover"))
+    kinds = np.full(n, HOVER)
     for leg in reversed(range(legs.shape[1])):
         kind = legs[:, leg].argmax(axis=1)
         able = legs[:, leg].any(axis=1) & may[np.arange(n), kind]

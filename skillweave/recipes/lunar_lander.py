@@ -13,6 +13,8 @@ of the steps, ``center`` in the rest. A flat agent lands as well (``skillweave d
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from skillweave import (
@@ -93,16 +95,7 @@ HOLDING = PPO(
 # A landing is worth more than hovering forever (+100 once against +1 a step) only where γ is well
 # below 0.99, and only to an agent that can already touch the ground without crashing:
 # hence more exploration at first, and most of the steps that skills have to themselves.
-LANDING = PPO(
-    learning_rate=3e-3,
-    gamma=0.98,
-    gae_lambda=0.95,
-    batch_size=1024,
-    update_epochs=3,
-    ent_coef=0.02,
-    ent_coef_final=0.002,
-    network=RELU,
-)
+LANDING = replace(HOLDING, learning_rate=3e-3, ent_coef=0.02, ent_coef_final=0.002)
 SELECTOR = PPO(
     num_envs=256,  # fewer, longer steps of the engine: acting costs nearly the same for all
     n_steps=40,  # 4 calls

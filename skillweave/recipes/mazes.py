@@ -26,6 +26,7 @@ import numpy as np
 from skillweave import PPO, Apart, Hierarchy, Network, Selection, Skill, Step, TrainDefaults
 from skillweave.algorithms import register_encoder
 from skillweave.recipes._mazes import GOAL, PLACE, SPEED, spec
+from skillweave.recipes._specs import given
 from skillweave.types import Array
 
 SLOW = 0.3
@@ -218,10 +219,7 @@ def declare(maze: str = "large", **how: Any) -> Hierarchy:
 def with_skills(maze: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     """Return the hierarchy on a maze with skills that are there already, by name."""
     settings = {"selector": FURTHER_SELECTOR, "apart": Apart(selector_steps=200_000)} | how
-    hierarchy = declare(maze, **settings)
-    for skill in hierarchy.skills:
-        skill.policy = skills[skill.name]
-    return hierarchy
+    return given(declare(maze, **settings), skills)
 
 
 hierarchy = declare()

@@ -21,6 +21,7 @@ Needs gymnasium-robotics: ``pip install 'skillweave[robotics]'``.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -94,9 +95,7 @@ class Above(Skill):
         """Return whether it is above the block."""
         return is_above(step.next_obs)
 
-    def success(self, step: Step) -> Array:
-        """Return whether it is above the block."""
-        return is_above(step.next_obs)
+    success = termination
 
 
 class Descend(Skill):
@@ -130,9 +129,7 @@ class Close(Skill):
         """Return whether they hold it."""
         return is_grasped(step.next_obs)
 
-    def success(self, step: Step) -> Array:
-        """Return whether they hold it."""
-        return is_grasped(step.next_obs)
+    success = termination
 
 
 class Carry(Skill):
@@ -177,9 +174,7 @@ class Recover(Skill):
         """Return whether it is between them."""
         return is_around(step.next_obs)
 
-    def success(self, step: Step) -> Array:
-        """Return whether it is between them."""
-        return is_around(step.next_obs)
+    success = termination
 
 
 script = sw.Automaton(
@@ -214,16 +209,7 @@ LEARNER = PPO(
     gae_lambda=0.95,
     network=RELU,
 )
-SELECTOR = PPO(
-    min_advantage_std=0.0,  # the figures were measured with it
-    num_envs=16,
-    n_steps=128,
-    batch_size=64,
-    update_epochs=8,
-    gamma=0.98,
-    gae_lambda=0.95,
-    network=RELU,
-)
+SELECTOR = replace(LEARNER, batch_size=64)
 FUNCTIONS = {"above": above, "descend": descend, "close": close, "carry": carry}
 
 

@@ -30,6 +30,7 @@ import numpy as np
 
 from skillweave import PPO, Automaton, Hierarchy, Network, Skill, Step, Together
 from skillweave.recipes._cheetah import LEG, SPEED, spec
+from skillweave.recipes._specs import given
 from skillweave.types import Array
 
 UNIT = 1000.0
@@ -75,9 +76,7 @@ class Forward(Skill):
         """Return whether the leg is done."""
         return arrived(step)
 
-    def success(self, step: Step) -> Array:
-        """Return whether the leg is done."""
-        return arrived(step)
+    success = termination
 
 
 class Backward(Forward):
@@ -175,10 +174,8 @@ def with_skills(points: tuple[float, ...], skills: Mapping[str, Any], **how: Any
         "selector": FURTHER_SELECTOR,
         "call_steps": FURTHER_CALL_STEPS,
     } | how
-    hierarchy = declare(points, **settings)
+    hierarchy = given(declare(points, **settings), skills)
     hierarchy.env = spec(points)  # sixteen environments are too few to be shared out
-    for skill in hierarchy.skills:
-        skill.policy = skills[skill.name]
     return hierarchy
 
 

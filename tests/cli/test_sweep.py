@@ -191,7 +191,7 @@ def test_nor_does_one_whose_module_was_edited(swept, helper, recipe, trained):
 def test_of_a_shipped_recipe_its_parts_count_and_nothing_else_of_the_library():
     load("mazes")
     found = code_files(source("mazes"))
-    assert set(found) == {"", "skillweave.recipes._mazes"}
+    assert set(found) == {"", "skillweave.recipes._mazes", "skillweave.recipes._specs"}
     assert found[""] == source("mazes")
 
 

@@ -11,7 +11,6 @@ from skillweave.compat.agilerl.algorithms.dqn import DQN
 from skillweave.compat.agilerl.algorithms.dqn_rainbow import RainbowDQN
 from skillweave.compat.agilerl.algorithms.ppo import PPO
 from skillweave.compat.agilerl.algorithms.td3 import TD3
-from skillweave.compat.batches import rollout_of
 from skillweave.errors import RunError, SkillweaveError
 
 OBS = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
@@ -26,14 +25,13 @@ KINDS = {
 
 
 def record(agent: PPO, steps: int = 30, n: int = 1):
-    """What a hand-written loop collects."""
+    """What a hand-written loop collects: lists of arrays, and the last observations."""
     rng = np.random.default_rng(1)
     states = [rng.normal(size=(n, 8)).astype(np.float32) for _ in range(steps)]
-    acted = [agent.getAction(s) for s in states]
+    actions, log_probs, _, values = zip(*map(agent.getAction, states), strict=True)
     rewards = [rng.normal(size=n) for _ in range(steps)]
     ends = [rng.random(n) < 0.1 for _ in range(steps)]
-    columns = [[a[i] for a in acted] for i in (0, 1, 3)]
-    return (states, columns[0], columns[1], rewards, ends, columns[2], states[0])
+    return [states, actions, log_probs, rewards, ends, values, states[0]]
 
 
 def transitions(agent, batch: int = 32):
@@ -62,26 +60,20 @@ def test_acting_in_numpy_says_what_torch_says(activation, layer_norm):
     how = {"mlp_activation": activation, "layer_norm": layer_norm}
     agent = KINDS["ppo"](net_config={"arch": "mlp", "hidden_size": [32, 16], **how})
     for _ in range(2):  # before and after learning
-        native = agent.native
-        actor = native.learner.acting_params(native.member.state)
-        obs = torch.from_numpy(OBS)[None]
-        _, head, _ = native.learner.act(actor, obs, None, None)
-        np.testing.assert_allclose(native.numpy_actor.output(OBS), head[0].numpy(), atol=1e-5)
-        action, log_prob, entropy, value = agent.getAction(OBS)
-        want, spread = native.learner.head.stats(head[0], None, None, torch.from_numpy(action))
-        np.testing.assert_allclose(log_prob, want, atol=1e-5)
-        np.testing.assert_allclose(entropy, spread, atol=1e-5)
-        want = native.learner.value(native.member.state, obs)[0]
-        np.testing.assert_allclose(value, want.detach(), atol=1e-5)
+        learner, state, obs = agent.learner, agent.member.state, torch.from_numpy(OBS)[None]
+        _, head, _ = learner.act(learner.acting_params(state), obs, None, None)
+        action, *found = agent.getAction(OBS)
+        want = learner.head.stats(head[0], None, None, torch.from_numpy(action))
+        value = learner.value(state, obs)[0].detach()
+        np.testing.assert_allclose(found, torch.stack([*want, value]), atol=1e-5)
         agent.learn(record(agent))
 
 
 def test_actions_are_drawn_with_their_probabilities():
     agent = KINDS["ppo"]()
-    agent.native.learner.layout.views(agent.native.member.state.params)["actor.2.bias"].copy_(
-        torch.tensor([0.0, 1.0, -1.0, 2.0])
-    )
-    agent.native.become(agent.native.member)
+    views = agent.learner.layout.views(agent.member.state.params)
+    views["actor.2.bias"].copy_(torch.tensor([0.0, 1.0, -1.0, 2.0]))
+    agent.become(agent.member)
     many = np.repeat(OBS[:1], 20_000, axis=0)
     action, log_prob, _, _ = agent.getAction(many)
     drawn = np.bincount(action, minlength=4) / len(many)
@@ -92,48 +84,39 @@ def test_actions_are_drawn_with_their_probabilities():
 @pytest.mark.parametrize("kind", ["ppo", "continuous"])
 def test_learn_takes_the_log_probabilities_as_they_are_given(kind):
     agent = KINDS[kind]()
-    states, actions, log_probs, rewards, ends, _, after = record(agent)
-    given = [x - 0.5 for x in log_probs]  # of other states, as the selector's loop has them
-    native = agent.native
-    rollout = rollout_of(
-        native.learner, native.member.state, states, actions, given, rewards, ends, after
-    )
-    found, _ = native.learner.head.stats(rollout.dist_params, rollout.log_std, None, rollout.action)
-    np.testing.assert_allclose(found.flatten(), np.concatenate(given), atol=1e-4)
+    steps = record(agent)
+    steps[2] = [x - 0.5 for x in steps[2]]  # of other states, as the selector's loop has them
+    rollout = agent.rollout(steps)
+    head = agent.learner.head
+    found, _ = head.stats(rollout.dist_params, rollout.log_std, None, rollout.action)
+    np.testing.assert_allclose(found.flatten(), np.concatenate(steps[2]), atol=1e-4)
 
 
 def test_a_record_becomes_a_rollout_that_ends_where_it_ended():
     agent = KINDS["ppo"](gamma=0.9)
-    states, actions, log_probs, rewards, ends, _, after = record(agent, steps=4, n=2)
-    ends = [np.array(e) for e in ([0, 0], [1, 0], [0, 0], [0, 0])]
-    native = agent.native
-    tr = rollout_of(
-        native.learner, native.member.state, states, actions, log_probs, rewards, ends, after
-    )
+    steps = record(agent, steps=4, n=2)
+    steps[4] = [np.array(e) for e in ([0, 0], [1, 0], [0, 0], [0, 0])]
+    tr = agent.rollout(steps)
     np.testing.assert_allclose(tr.discount[0, :, 0], [0.9, 0.0, 0.9, 0.9])
     assert tr.last[0].tolist() == [[False, False], [True, False], [False, False], [True, True]]
-    np.testing.assert_array_equal(tr.next_obs[0, 0], states[1])
-    np.testing.assert_array_equal(tr.next_obs[0, -1], after)
-    np.testing.assert_allclose(tr.reward[0], np.stack(rewards), rtol=1e-6)
+    np.testing.assert_array_equal(tr.next_obs[0, 0], steps[0][1])
+    np.testing.assert_array_equal(tr.next_obs[0, -1], steps[-1])
+    np.testing.assert_allclose(tr.reward[0], np.stack(steps[3]), rtol=1e-6)
 
 
 def test_learn_takes_scalars_of_a_single_environment_too():
     agent = KINDS["ppo"]()
-    states, actions, log_probs, rewards, ends, values, after = record(agent)
-    alone = [[x[0] for x in column] for column in (states, actions, log_probs, rewards, ends)]
-    assert np.isfinite(agent.learn((*alone, [v[0] for v in values], after[0])))
+    *columns, after = record(agent)
+    assert np.isfinite(agent.learn([*([x[0] for x in column] for column in columns), after[0]]))
 
 
 def test_the_policy_learns_what_is_rewarded():
     torch.manual_seed(0)
     agent = KINDS["ppo"](lr=3e-3, gamma=0.0)
     for _ in range(15):
-        states = [OBS[i % 5][None] for i in range(64)]
-        acted = [agent.getAction(s) for s in states]
-        rewards = [(a[0] == 2).astype(float) for a in acted]
-        columns = [[a[i] for a in acted] for i in (0, 1, 3)]
-        ends = [np.array([False])] * 64
-        agent.learn((states, columns[0], columns[1], rewards, ends, columns[2], states[0]))
+        steps = record(agent, steps=64)
+        steps[3] = [(action == 2).astype(float) for action in steps[1]]
+        agent.learn(steps)
     assert (agent.getAction(np.repeat(OBS, 40, axis=0))[0] == 2).mean() > 0.9
 
 
@@ -148,7 +131,7 @@ def test_off_policy_agents_act_within_bounds_and_learn(kind):
     else:
         assert (action.shape, action.dtype) == ((5, 2), np.float32)
         drawn = np.concatenate([agent.getAction(OBS, epsilon=1.0) for _ in range(50)])
-        low, high = agent.native.spaces[1].low[0], agent.native.spaces[1].high[0]
+        low, high = agent.spaces[1].low[0], agent.spaces[1].high[0]
         assert low <= drawn.min() < low + 0.3 < high - 0.3 < drawn.max() <= high
     batch = transitions(agent)
     losses = [agent.learn(batch) for _ in range(60)]
@@ -179,15 +162,14 @@ def test_a_checkpoint_is_the_agent_it_was(kind, tmp_path):
     agent.saveCheckpoint(tmp_path / "agent.pt")
     found = type(agent).load(str(tmp_path / "agent.pt"))
     assert (found.scores, found.fitness, found.steps, found.index) == ([1.0], [2.5], [0, 64], 3)
-    assert (found.batch_size, found.lr if hasattr(found, "lr") else 0) == (
-        16, agent.lr if hasattr(agent, "lr") else 0,
-    )  # fmt: skip
-    for name, value in vars(agent.native.member.state).items():
-        assert torch.equal(value, getattr(found.native.member.state, name)), name
+    assert found.batch_size == 16
+    assert found.member.config == agent.member.config
+    for name, value in vars(agent.member.state).items():
+        assert torch.equal(value, getattr(found.member.state, name)), name
     clone = agent.clone(7)
     assert (clone.index, clone.scores, agent.index) == (7, [1.0], 3)
-    clone.native.member.state.params.zero_()
-    assert agent.native.member.state.params.any()
+    clone.member.state.params.zero_()
+    assert agent.member.state.params.any()
 
 
 def test_a_checkpoint_is_a_native_policy(tmp_path):
@@ -199,20 +181,20 @@ def test_a_checkpoint_is_a_native_policy(tmp_path):
     tensors, header = read_tensors(tmp_path / "agent.pt")
     policy = AgentPolicy.from_file(tensors, record_in(AgentHeader, header, "agent.pt"), "agent.pt")
     action, _ = policy.act({}, OBS)
-    np.testing.assert_array_equal(action, agent.native.numpy_actor.output(OBS).argmax(-1))
+    np.testing.assert_array_equal(action, agent.act(OBS, explore=False))
 
 
 def test_settings_are_those_of_the_native_agent():
     agent = KINDS["ppo"]()
     agent.lr, agent.batch_size = 5e-4, np.int64(32)
-    config = agent.native.member.config
+    config = agent.member.config
     assert (config.learning_rate, config.batch_size) == (5e-4, 32)
     assert config.min_advantage_std == 0.0  # AgileRL has no such limit
-    assert float(agent.native.member.state.learning_rate[0]) == pytest.approx(5e-4)
+    assert float(agent.member.state.learning_rate[0]) == pytest.approx(5e-4)
     other = KINDS["td3"](lr_actor=1e-4, lr_critic=1e-3, learn_step=5)
     assert (other.lr_critic, other.learn_step) == (1e-3, 5)
-    assert other.native.member.config.actor_rate == pytest.approx(0.1)
-    assert other.native.member.config.action_l2 == 0.0  # AgileRL has no such cost
+    assert other.member.config.actor_rate == pytest.approx(0.1)
+    assert other.member.config.action_l2 == 0.0  # AgileRL has no such cost
     other.learn_step = 3
     assert other.learn_step == 3
 

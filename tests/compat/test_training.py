@@ -118,14 +118,14 @@ def test_off_policy_algorithms_train(algo):
         memory = PrioritizedReplayBuffer(2, 1000, FIELDS, num_envs=2)
         more = MultiStepReplayBuffer(2, 1000, FIELDS, num_envs=2, n_step=3, gamma=0.99)
         how = {"per": True, "n_step": True, "noisy": True, "n_step_memory": more}
-    before = pop[0].native.member.state.params.clone()
+    before = pop[0].member.state.params.clone()
     found, fitnesses = train_off_policy(
         env, "x", algo, pop, memory, n_episodes=2, max_steps=30, evo_epochs=2, target=None,
         verbose=False, **how,
     )  # fmt: skip
     assert np.shape(fitnesses) == (1, 2)
     assert len(memory) > 100
-    assert not torch.equal(before, found[0].native.member.state.params)
+    assert not torch.equal(before, found[0].member.state.params)
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from goals.worlds import SPACES, GoTo, Point, Rest, go_to, place_of
+from playing import alike
 from test_networks import agent
 
 import skillweave as sw
@@ -231,24 +232,15 @@ def numbers_of(goal: Any) -> list[Any]:
 
 def episodes(env: Point, policy: HierarchyPolicy, runner: Runner, other: Any) -> list[Any]:
     """Whole episodes, in which all three act alike; of each step the skill, goal and action."""
-    players, told = (Player(policy), Player(other)), []
+    player, loaded, told = Player(policy), Player(other), []
     for seed in range(3):
-        obs, info = env.reset(seed=seed)
-        for one in (*players, runner):
-            one.reset()
-        reward, over = 0.0, False
-        while not over:
-            action, *others = (p.act(obs, reward=reward, info=info) for p in (*players, runner))
-            for theirs in others:
-                np.testing.assert_allclose(theirs, action, atol=1e-5)
-            memory = players[0].memory
+        for action in alike(env, player, loaded, runner, seed=seed):
+            memory = player.memory
             goal, its = policy.goal_now(memory), policy.goal_now(runner.memory)
             assert (goal is None) == (its is None)
             for mine, theirs in zip(*map(numbers_of, (goal, its)), strict=True):
                 np.testing.assert_allclose(theirs, mine, atol=1e-5)
             told.append((int(memory["skill"][0]), str(goal), np.round(action, 3).tolist()))
-            obs, reward, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
     return told
 
 

@@ -9,18 +9,21 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from test_networks import NESTED, one_by_one, same
+from skills.mapped_models import ACTION, SPACE, observations, one
+from test_networks import NESTED, compare, one_by_one
 
 import skillweave as sw
 from skillweave import from_onnx, from_torch
 from skillweave.api.player import Player
 from skillweave.errors import PolicyError
+from skillweave.export.foreign import as_file
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.policies.actor import Actor
 from skillweave.policies.codec import read_folder
 
 pytest.importorskip("onnxscript")
+pytest.importorskip("stable_baselines3")
 torch.set_num_threads(1)
 OBS = gym.spaces.Box(-3, 3, (4,), np.float64)
 SPACES: dict[str, tuple[gym.Space[Any], int]] = {  # and how many numbers the network returns
@@ -50,19 +53,9 @@ def linear(path: Path, outputs: int, opset: int, whole: bool = False) -> Path:
     return path
 
 
-def compare(policy: Any, folder: Path, choices: int) -> set[str]:
+def exported(policy: Any, folder: Path, parts: Any = ()) -> None:
     write_export(folder, policy, "toy")
-    runner, player, told = Runner(folder), Player(policy), set()
-    rng = np.random.default_rng(0)
-    for i, obs in enumerate(one_by_one(policy.observation_space, 30)):
-        mask = None
-        if choices and i % 2:
-            mask = rng.random(choices) < 0.5
-            mask[[0, choices - 1]] = True  # one of each part
-        action = player.act(obs, mask=mask)
-        assert same(runner.act(obs, mask=mask), action)
-        told.add(str(np.round(action, 4)))
-    return told
+    compare(policy, folder, one_by_one(policy.observation_space, 30), parts)
 
 
 @pytest.mark.parametrize("opset", [11, 17])
@@ -70,14 +63,13 @@ def compare(policy: Any, folder: Path, choices: int) -> set[str]:
 def test_a_file_acts_as_here(kind: str, opset: int, tmp_path: Path) -> None:
     space, outputs = SPACES[kind]
     policy = from_onnx(linear(tmp_path / "net.onnx", outputs, opset)).bind(OBS, space, "it")
-    masked = kind in ("Discrete", "MultiDiscrete")
-    assert len(compare(policy, tmp_path / "out", outputs if masked else 0)) > 1
+    exported(policy, tmp_path / "out", {"Discrete": (3,), "MultiDiscrete": (2, 3)}.get(kind, ()))
 
 
 def test_whole_numbers_of_a_file_are_actions(tmp_path: Path) -> None:
     space = gym.spaces.Discrete(3)
     policy = from_onnx(linear(tmp_path / "net.onnx", 3, 17, whole=True)).bind(OBS, space, "it")
-    assert len(compare(policy, tmp_path / "out", 0)) > 1
+    exported(policy, tmp_path / "out")
 
 
 class Drawn(np.random.Generator):
@@ -125,7 +117,7 @@ def test_a_module_acts_as_here(tmp_path: Path) -> None:
     torch.manual_seed(0)
     space = SPACES["MultiDiscrete"][0]
     policy = from_torch(Sees()).bind(NESTED, space, "it")
-    assert len(compare(policy, tmp_path, 5)) > 1
+    exported(policy, tmp_path, (2, 3))
 
 
 @pytest.mark.parametrize(
@@ -155,3 +147,78 @@ def test_an_action_that_does_not_exist_is_refused_as_in_training(
     export = sw.save_policy(policy, tmp_path)
     with pytest.raises(PolicyError, match=r"no action of|NaN or an infinity|whole numbers"):
         Runner(tmp_path, export.functions).act(obs)
+
+
+# On a nested observation, and of Stable-Baselines3
+
+
+class Parts(torch.nn.Module):
+    """Reads two parts of the whole observation."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.layer = torch.nn.Linear(8, 5)
+
+    def forward(self, obs: Any) -> torch.Tensor:
+        return self.layer(torch.cat([obs["gyro"], obs["arm"]["joints"]], dim=1))
+
+
+def program(folder: Path) -> Any:
+    """A program of ``torch.export``."""
+    module = torch.nn.Sequential(torch.nn.Linear(3, 5), torch.nn.Tanh())
+    torch.export.save(torch.export.export(module, (torch.zeros(1, 3),)), folder / "net.pt2")
+    return sw.from_torch(folder / "net.pt2", trust=True, sees="gyro", acts=sw.Acts(scale=1.5))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [program, lambda folder: sw.from_torch(Parts())])
+def test_a_module_is_exported_as_it_is(make: Any, tmp_path: Path) -> None:
+    policy = make(tmp_path).bind(SPACE, ACTION, "it")
+    write_export(tmp_path / "out", policy, "robot")
+    compare(policy, tmp_path / "out", [one(obs, 0) for obs in observations(1, 40, seed=4)])
+    player, loaded = Player(policy), Player(sw.load_policy(tmp_path / "out"))
+    for obs in observations(1, 5):
+        action = player.act(one(obs, 0))
+        np.testing.assert_allclose(loaded.act(one(obs, 0)), action, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "env"),
+    [
+        ("PPO", "CartPole-v1"),
+        ("DQN", "CartPole-v1"),
+        ("SAC", "Pendulum-v1"),
+        ("TD3", "Pendulum-v1"),
+    ],
+)
+def test_models_of_stable_baselines3_are_exported(kind: str, env: str, tmp_path: Path) -> None:
+    import stable_baselines3 as sb3
+
+    less = {} if kind == "PPO" else {"buffer_size": 100}
+    model = getattr(sb3, kind)("MlpPolicy", env, seed=0, device="cpu", **less)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for weight in model.policy.parameters():  # far from zeros, so that actions differ
+            weight += torch.randn_like(weight)
+    policy = sw.from_sb3(model)
+    write_export(tmp_path, policy, env)
+    runner, loaded = Runner(tmp_path), Player(sw.load_policy(tmp_path))
+    rng, size = np.random.default_rng(0), policy.observation_space.shape
+    told = []
+    for _ in range(30):
+        obs = rng.normal(size=size).astype(np.float32)
+        wanted = model.predict(obs, deterministic=True)[0]
+        np.testing.assert_allclose(runner.act(obs), wanted, atol=1e-5)
+        np.testing.assert_allclose(loaded.act(obs), wanted, atol=1e-5)
+        told.append(wanted)
+    assert len(np.unique(told)) > 1
+
+
+def test_what_the_runner_cannot_sample_says_what_to_do() -> None:
+    import stable_baselines3 as sb3
+
+    policy = sw.from_sb3(sb3.PPO("MlpPolicy", "CartPole-v1", device="cpu"))
+    with pytest.raises(PolicyError, match=r"policy of 'x' samples by .*greedy_skills=True"):
+        as_file(policy.in_place, "the policy of 'x'", sampled=True)

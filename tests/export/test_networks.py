@@ -122,12 +122,38 @@ def one_by_one(space: gym.Space[Any], n: int) -> list[Any]:
     return [unpack(space, batch[i]) for i in range(n)]
 
 
-def same(a: Any, b: Any) -> bool:
+def same(a: Any, b: Any, rtol: float = 1e-4) -> bool:
     """Actions that are the same, numbers up to rounding."""
     a, b = np.asarray(a), np.asarray(b)
     if a.shape != b.shape or a.dtype != b.dtype:
         return False
-    return np.allclose(a, b, rtol=1e-4, atol=1e-5) if a.dtype.kind == "f" else bool((a == b).all())
+    return np.allclose(a, b, rtol=rtol, atol=1e-5) if a.dtype.kind == "f" else bool((a == b).all())
+
+
+def compare(
+    policy: Any,
+    folder: Path,
+    seen: Any,
+    parts: Any = (),
+    code: Any = None,
+    rtol: float = 1e-4,
+) -> list[Any]:
+    """Let a player and the runner act the same, in three episodes; return the actions.
+
+    ``parts``: numbers of choices, of which masks allow some, now and then.
+    """
+    player, runner, rng, told = Player(policy), Runner(folder, code), np.random.default_rng(0), []
+    for i, obs in enumerate(seen):
+        if i in (7, 20):
+            player.reset(), runner.reset()
+        mask = None
+        if parts and i % 2:
+            mask = rng.random(sum(parts)) < 0.5
+            mask[np.cumsum([1, *parts[:-1]])] = True  # one of each part
+        told.append(player.act(obs, mask=mask))
+        assert same(runner.act(obs, mask=mask), told[-1], rtol)
+    assert len({str(np.round(x, 3)) for x in told}) > 1  # a constant would agree with anything
+    return told
 
 
 @pytest.mark.fast_cases(1)
@@ -139,22 +165,9 @@ def test_a_plain_agent_acts_as_here(case: Any, tmp_path: Path) -> None:
     assert export.code == {}
     written = (tmp_path / "agent.onnx").read_bytes()
     assert b"skillweave" not in written  # no paths of the machine that wrote it
-    theirs, mine = Runner(tmp_path), Player(policy)
-    rng = np.random.default_rng(0)
-    seen = one_by_one(obs_space, 40)
-    choices = 0 if isinstance(action_space, gym.spaces.Box) else policy.algorithm.codec.size
-    told = []
-    for i, obs in enumerate(seen):
-        if i == 20:
-            theirs.reset(), mine.reset()
-        mask = None
-        if choices and i % 3 == 0:
-            mask = rng.random(choices) < 0.5
-            mask[np.cumsum([1, *policy.algorithm.codec.parts[:-1]])] = True  # one of each part
-        told.append(mine.act(obs, mask=mask))
-        assert same(theirs.act(obs, mask=mask), told[-1])
-        assert action_space.contains(told[-1])
-    assert len({str(np.round(x, 3)) for x in told}) > 1  # a constant would agree with anything
+    parts = policy.algorithm.codec.parts
+    for action in compare(policy, tmp_path, one_by_one(obs_space, 40), parts):
+        assert action_space.contains(action)
 
 
 @pytest.mark.fast_cases(1)

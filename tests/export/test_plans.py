@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from goals.worlds import ON, SPACES, Point, Rest, declared
+from playing import episode
 from ready_selectors.chain import DOOR, PLACE, Corridor, GetKey, Leave, OpenDoor, Wait, at_four
 
 from skillweave import EnvSpec, Lengths
@@ -99,14 +100,7 @@ class Walled(Noisy):
 
 
 def played(env: Any, actor: Any, seed: int) -> list[int]:
-    obs, info = env.reset(seed=seed)
-    actor.reset()
-    reward, actions, over = None, [], False
-    while not over:
-        actions.append(int(actor.act(obs, reward=reward, info=info)))
-        obs, reward, terminated, truncated, info = env.step(actions[-1])
-        over = terminated or truncated
-    return actions
+    return [int(action) for (action,) in episode(env, actor, seed=seed)]
 
 
 @pytest.fixture(scope="module")
@@ -226,16 +220,10 @@ def with_goals(space: str, seed: int = 0, **how: Any) -> Any:
 
 def acted_in(env: Any, policy: Any, actor: Any, seed: int) -> list[Any]:
     """Of each step of an episode the running skill, its goal, and the action."""
-    obs, info = env.reset(seed=seed)
-    actor.reset()
-    found, reward, over = [], None, False
-    while not over:
-        action = actor.act(obs, reward=reward, info=info)
-        skill, goal = int(actor.memory["skill"][0]), policy.goal_now(actor.memory)
-        found.append((skill, str(goal), action.tolist()))
-        obs, reward, terminated, truncated, info = env.step(action)
-        over = terminated or truncated
-    return found
+    return [
+        (int(actor.memory["skill"][0]), str(policy.goal_now(actor.memory)), action.tolist())
+        for (action,) in episode(env, actor, seed=seed)
+    ]
 
 
 @pytest.mark.fast_cases(3)

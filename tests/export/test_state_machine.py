@@ -1,9 +1,10 @@
-"""A hierarchy with networks, exported; tests/calls compares the state machine with the player."""
+"""What an export of a hierarchy holds; ``test_read`` lets exports act."""
 
 from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from playing import alike
 from reference_calls import POSITION, TAG, Counter, Left, Right, T, Walk, Zigzag, scripted, shy
 from test_networks import agent
 from toys import skills_of
@@ -141,34 +143,15 @@ POLICIES: dict[str, Any] = {
 }
 
 
-def played(policy: HierarchyPolicy, runner: Runner, episodes: int) -> list[tuple[int, int, bool]]:
-    """Whole episodes, in which both act alike; of each step the skill, the action, a decision."""
-    env, player, told = LongWalk(), Player(policy), []
-    for episode in range(episodes):
-        obs, info = env.reset(seed=episode)
-        player.reset(), runner.reset()
-        reward, over = 0.0, False
-        while not over:
-            action = player.act(obs, reward=reward, info=info)
-            assert runner.act(obs, reward=reward, info=info) == action
-            memory = player.memory
-            assert runner.memory["skill"][0] == memory["skill"][0]
-            told.append((int(memory["skill"][0]), int(action), memory["elapsed"][0] == 0))
-            obs, reward, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
+def played(policies: Sequence[Any], *runners: Runner, n: int = 5) -> set[tuple[str, int, bool]]:
+    """Play n episodes, in which all act alike; all skills, actions, and whether one decided."""
+    players, told = [Player(policy) for policy in policies], set()
+    for seed in range(n):
+        for action in alike(LongWalk(), *players, *runners, seed=seed):
+            (name,) = {p.acts(actor.memory) for p, actor in zip(policies, players, strict=True)}
+            (_,) = {int(actor.memory["skill"][0]) for actor in (*players, *runners)}
+            told.add((name, int(action), players[0].memory["elapsed"][0] == 0))
     return told
-
-
-@pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("make", POLICIES.values(), ids=POLICIES)
-def test_the_runner_calls_the_same_skills(make: Any, tmp_path: Path) -> None:
-    policy = make()
-    export = write_export(tmp_path, policy, "walk")
-    told = played(policy, Runner(tmp_path, export.functions), 6)
-    skills, actions, decisions = (set(x) for x in zip(*told, strict=True))
-    assert len(skills) > 1  # so that choices are compared, and calls of several steps
-    assert len(actions) > 1
-    assert decisions == {True, False}
 
 
 def test_code_that_is_missing_is_named_with_what_it_is(tmp_path: Path) -> None:
@@ -229,7 +212,7 @@ def test_networks_from_elsewhere_are_exported_too(tmp_path: Path) -> None:
     policy = trained(skill_set(Module, File, Free))
     export = write_export(tmp_path / "out", policy, "walk")
     assert export.code == {}
-    assert len({skill for skill, _, _ in played(policy, Runner(tmp_path / "out"), 4)}) > 1
+    assert len({skill for skill, _, _ in played([policy], Runner(tmp_path / "out"))}) > 1
     runner, player = Runner(tmp_path / "out"), Player(policy)
     with_mask = np.array([False, True, True])
     for obs in np.random.default_rng(0).normal(size=(30, 4)).astype(np.float32):

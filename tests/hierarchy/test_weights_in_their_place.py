@@ -6,16 +6,14 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import pytest
 import torch
 from declaring import plainly
 
-from skillweave import DQN, PPO, Hierarchy, Network, Skill, SkillweaveError
-from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.policy import make_algorithm, state_from
+from skillweave import PPO, Hierarchy, Network, Skill, SkillweaveError
+from skillweave.algorithms.policy import state_from
 from skillweave.cli import main
-from skillweave.compat.single_agent import load_agent, save_agent
+from skillweave.compat.agilerl import agents as agilerl
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
 
 SMALL = PPO(num_envs=2, n_steps=8, batch_size=16, network=Network((4,)), overlap=False)
@@ -155,23 +153,17 @@ def test_a_flat_agents_damaged_header_is_told_by_the_command_line(
 
 def test_an_agents_state_of_another_shape_or_type_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "agent.safetensors"
-    made = agent()
-    save_agent(path, made, made.init([Seeds(0)]), {})
+    agilerl.DQN((3,), 2, False).saveCheckpoint(path)
     tensors, header = read_tensors(path)
-    load_agent(path, Seeds(1))
+    agilerl.DQN.load(path)
     for changed in (tensors["state.mu"][:, :-1].clone(), tensors["state.mu"].double()):
         write_tensors(path, tensors | {"state.mu": changed}, header)
         with pytest.raises(SkillweaveError, match="tensor mu should"):
-            load_agent(path, Seeds(1))
-
-
-def agent() -> Any:
-    box = gym.spaces.Box(-1.0, 1.0, (3,))
-    return make_algorithm(DQN(network=Network((4,))), box, gym.spaces.Discrete(2))
+            agilerl.DQN.load(path)
 
 
 def test_a_state_that_lacks_a_tensor_is_refused_by_name() -> None:
-    state = agent().init([Seeds(0)])
+    state = agilerl.DQN((3,), 2, False).member.state
     tensors = dict(vars(state))
     assert torch.equal(state_from(tensors, state, "x").params, state.params)
     del tensors["params"]

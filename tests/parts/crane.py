@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from playing import episode
 from small_runs import goes_on
 
 import skillweave as sw
@@ -19,7 +20,7 @@ ON = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMAL
 class Crane(gym.Env):
     """An arm of two numbers and a hook of one; an episode has 20 steps.
 
-    It notes each action in ``actions``. ``kind`` says of what space actions are.
+    ``kind`` says of what space actions are.
     """
 
     observation_space: Any = gym.spaces.Dict(
@@ -39,7 +40,6 @@ class Crane(gym.Env):
             "bits": gym.spaces.MultiBinary(3),
             "one": gym.spaces.Discrete(4),
         }[kind]
-        self.actions: list[Any] = []
 
     def _obs(self) -> Any:
         picture = np.full((8, 8, 3), self.steps, np.uint8)
@@ -60,7 +60,6 @@ class Crane(gym.Env):
         return self._obs(), self._info()
 
     def step(self, action: Any) -> Any:
-        self.actions.append(np.copy(action))
         push = np.zeros(3, np.float32)
         if self.kind == "one":
             push[action % 3] = 1.0
@@ -88,6 +87,11 @@ class Hook(sw.Skill):
 
     def reward(self, step: sw.Step) -> Any:
         return step.next_obs["hook"][:, 0]
+
+
+def acted(actor: Any) -> Any:
+    """Return the actions of an episode, (20, 3)."""
+    return np.array([action for (action,) in episode(Crane(), actor)])
 
 
 def crane(skills: Any = None, **how: Any) -> sw.Hierarchy:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from crane import ON, Arm, Crane, Hook, crane
+from playing import alike, episode
 from torch import nn
 
 import skillweave as sw
@@ -25,22 +26,15 @@ pytest.importorskip("onnxscript")
 GREEDY = sw.Selection(greedy_skills=True, greedy_selector=True)
 
 
-def compare(policy: Any, folder: Any, code: Any, kind: str = "box", masked: bool = False) -> None:
+def compare(policy: Any, folder: Any, code: Any) -> None:
     """Let a player, the runner, and the policy that is read back act in two episodes."""
-    again = sw.Player(sw.load_policy(folder, code=code))
-    player, runner, env = sw.Player(policy), Runner(folder, code), Crane(kind, masked)
-    actions = []
-    for seed in range(2):
-        obs, info = env.reset(seed=seed)
-        player.reset(), runner.reset(), again.reset()
-        ended = False
-        while not ended:
-            action = player.act(obs, info=info)
-            np.testing.assert_allclose(runner.act(obs, info=info), action, atol=1e-5)
-            np.testing.assert_allclose(again.act(obs, info=info), action, atol=1e-5)
-            obs, _, _, ended, info = env.step(action)
-            actions.append(np.ravel(action))
+    actors = sw.Player(policy), Runner(folder, code), sw.Player(sw.load_policy(folder, code=code))
+    actions = [a for seed in range(2) for a in alike(Crane(), *actors, seed=seed)]
     assert len(np.unique(np.round(actions, 4), axis=0)) > 3
+
+
+def exported(run: Any, folder: Any) -> None:
+    compare(run.policy, folder, run.export(folder).functions)
 
 
 def in_turn(obs: Any) -> Any:
@@ -71,8 +65,7 @@ def test_learnt_skills_with_parts(sees, rest, tmp_path):
     run = crane(skills(sees), selector=in_turn, rest=rest, steps=130, selection=GREEDY).train(
         quiet=True
     )
-    export = run.export(tmp_path / "out")
-    compare(run.policy, tmp_path / "out", export.functions)
+    exported(run, tmp_path / "out")
 
 
 @pytest.mark.fast_cases(2)
@@ -88,22 +81,14 @@ def test_choices_with_parts(kind, tmp_path):
     env = sw.EnvSpec(lambda: Crane(kind), engine="sync", workers=1)
     how = {"selector": in_turn, "steps": 130, "selection": GREEDY}
     run = crane(declared(), env=env, **how, **rest).train(quiet=True)
-    ready = run.export(tmp_path / "out")
-    compare_choices(run.policy, tmp_path / "out", ready.functions, kind)
+    code = run.export(tmp_path / "out").functions
+    loaded = sw.load_policy(tmp_path / "out", code=code)
+    actors = run.player(), Runner(tmp_path / "out", code), sw.Player(loaded)
+    for action, *others in episode(Crane(kind), *actors):
+        assert all(np.array_equal(theirs, action) for theirs in others)
 
 
 ONES = {"arm": Arm, "hook": Hook}
-
-
-def compare_choices(policy: Any, folder: Any, code: Any, kind: str) -> None:
-    again = sw.Player(sw.load_policy(folder, code=code))
-    player, runner, env = sw.Player(policy), Runner(folder, code), Crane(kind)
-    obs, _ = env.reset(seed=0)
-    for _ in range(20):
-        action = player.act(obs)
-        assert np.array_equal(runner.act(obs), action)
-        assert np.array_equal(again.act(obs), action)
-        obs, *_ = env.step(action)
 
 
 def test_a_mask_is_cut_in_the_runner(tmp_path):
@@ -115,16 +100,12 @@ def test_a_mask_is_cut_in_the_runner(tmp_path):
     env = sw.EnvSpec(lambda: Crane("one", True), engine="sync", workers=1)
     run = crane([Some()], env=env, steps=130, selection=GREEDY).train(quiet=True)
     export = run.export(tmp_path / "out")
-    world, runner, player = Crane("one", True), Runner(tmp_path / "out", export.functions), None
-    player = run.player()
-    obs, info = world.reset(seed=0)
-    for _ in range(10):
-        action = runner.act(obs, info=info)
-        assert action == player.act(obs, info=info)
-        assert info["action_mask"][action]
-        obs, *_, info = world.step(action)
+    world, runner = Crane("one", True), Runner(tmp_path / "out", export.functions)
+    for action, theirs in episode(world, runner, run.player()):
+        assert action == theirs
+        assert world._info()["action_mask"][action]
     with pytest.raises(SkillError, match="allows none of the choices"):
-        runner.act(obs, mask=[0, 0, 1, 0])
+        runner.act(world._obs(), mask=[0, 0, 1, 0])
 
 
 def middle(obs: Any) -> Any:
@@ -148,8 +129,7 @@ def test_corrections(name, acts, tmp_path):
     skill = type("Better", (sw.Skill,), {"policy": sw.Residual(base, 0.5), "acts": acts})()
     rest = {} if acts is None else {"rest": (0.0, 0.25, 0.0)}
     run = crane([skill], steps=130, selection=GREEDY, **rest).train(quiet=True)
-    export = run.export(tmp_path / "out")
-    compare(run.policy, tmp_path / "out", export.functions)
+    exported(run, tmp_path / "out")
 
 
 ARM: Any = gym.spaces.Box(-1, 1, (2,), np.float32)
@@ -269,11 +249,8 @@ def test_skills_with_goals_and_parts(case: str, tmp_path: Any) -> None:
     policy = louder(crane([skill, Hook()], **how).train(seed=0, quiet=True).policy)
     export = write_export(tmp_path / "out", policy, "crane")
     compare(policy, tmp_path / "out", export.functions)
-    runner, env, goals = Runner(tmp_path / "out", export.functions), Crane(), set()
-    obs, _ = env.reset(seed=3)
-    for _ in range(20):
-        obs, *_ = env.step(runner.act(obs))
-        goals.add(str(policy.goal_now(runner.memory)))
+    runner = Runner(tmp_path / "out", export.functions)
+    goals = {str(policy.goal_now(runner.memory)) for _ in episode(Crane(), runner, seed=3)}
     assert len(goals) > 2
 
 
@@ -286,16 +263,10 @@ def test_a_plan_of_skills_with_goals_and_parts(tmp_path: Any) -> None:
     planned = run.plan(lambda obs: (obs["arm"] > 0.3).all(1), log, features=[0, 1, 2])
     export = planned.export(tmp_path / "out")
     assert "observations (n, ...) to features (n, F)" in export.code.values()
-    runner, player, env = Runner(tmp_path / "out", export.functions), planned.player(), Crane()
-    goals = set()
+    runner, player, goals = Runner(tmp_path / "out", export.functions), planned.player(), set()
     for seed in range(3):
-        obs, _ = env.reset(seed=seed)
-        player.reset(), runner.reset()
-        for _ in range(20):
-            action = player.act(obs)
-            np.testing.assert_allclose(runner.act(obs), action, atol=1e-5)
+        for _ in alike(Crane(), player, runner, seed=seed):
             goals.add(str(planned.policy.goal_now(runner.memory)))
-            obs, *_ = env.step(action)
     assert len(goals) > 5
 
 
@@ -303,5 +274,4 @@ def test_a_hierarchy_that_a_skill_corrects(tmp_path):
     ready = crane(steps=130, selection=GREEDY).train(quiet=True).policy
     skill = type("Better", (sw.Skill,), {"policy": sw.Residual(ready)})()
     run = crane([skill], steps=130, selection=GREEDY).train(quiet=True)
-    export = run.export(tmp_path / "out")
-    compare(run.policy, tmp_path / "out", export.functions)
+    exported(run, tmp_path / "out")

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from crane import SMALL, Arm, Crane, Hook, crane, goes_on_and_loads
+from crane import SMALL, Arm, Crane, Hook, acted, crane, goes_on_and_loads
 from small_runs import reports_every
 from torch import nn
 
@@ -80,14 +80,6 @@ def test_a_stopped_run_ends_with_the_same_weights(name, how, tmp_path):
     goes_on_and_loads(hierarchy, tmp_path)
 
 
-def episode(policy: Any, steps: int = 20, seed: int = 0) -> Any:
-    env, player = Crane(), sw.Player(policy)
-    obs, _ = env.reset(seed=seed)
-    for _ in range(steps):
-        obs, *_ = env.step(player.act(obs))
-    return np.array(env.actions)
-
-
 @pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", bases())
 def test_the_correction_is_added_to_the_ready_policy(name):
@@ -116,16 +108,14 @@ def test_training_starts_at_the_ready_policy():
     one = sw.PPO(num_envs=4, n_steps=16, batch_size=32, learning_rate=1e-12, network=SMALL)
     run = crane([skill], steps=64, algorithm=one, selector=one, selection=GREEDY).train(quiet=True)
     ready = sw.from_function(middle).bind(Crane.observation_space, Crane().action_space, "base")
-    assert np.abs(episode(run.policy) - episode(ready)).max() < 0.02
+    assert np.abs(acted(run.player()) - acted(sw.Player(ready))).max() < 0.02
 
 
 def test_the_skill_alone_acts_as_in_the_hierarchy():
     skill = declared(sw.from_function(counted, every=3))
     run = crane([skill], selection=GREEDY).train(quiet=True)
     alone = run._policy("better")
-    assert (episode(alone) == episode(run.policy)).all()
-    held = episode(alone)
-    assert len(held) == 20
+    assert (acted(sw.Player(alone)) == acted(run.player())).all()
     assert run.evaluate(2, skill="better").skills["better"].calls == 2
 
 
@@ -141,7 +131,7 @@ def test_a_call_after_another_skill_starts_the_ready_policy_afresh():
 
     better = declared(sw.from_function(counted, every=3), scale=1e-9)
     run = crane([better, Still()], selector=turns, selection=GREEDY).train(quiet=True)
-    actions = episode(run.policy, 12)[:, 0]
+    actions = acted(run.player())[:, 0]
     assert np.allclose(actions[:4], [0, 0, 0, 0.3], atol=1e-6)
     assert np.allclose(actions[8:12], [0.8, 0.8, 0.8, 1.0], atol=1e-6)
 
@@ -179,7 +169,7 @@ def test_a_correction_of_a_part():
 
     skill = type("Arm", (Arm,), {"policy": sw.Residual(hold, 0.2)})()
     run = crane([skill, Hook()], selector=lambda obs: np.full(len(obs), "arm")).train(quiet=True)
-    actions = episode(run.policy)
+    actions = acted(run.player())
     assert (actions[:, 2] == 0).all()
     env = Crane()
     obs, _ = env.reset(seed=0)
@@ -197,8 +187,8 @@ def test_a_hierarchy_is_corrected():
     skill = declared(ready, scale=1e-6)
     for learn in ("together", "apart"):
         run = crane([skill], learn=learn).train(quiet=True)
-        actions = episode(run.policy)
-        assert np.allclose(actions, episode(ready), atol=1e-5)
+        actions = acted(run.player())
+        assert np.allclose(actions, acted(sw.Player(ready)), atol=1e-5)
         assert np.allclose(actions[5], [0.25, 0.25, -0.5], atol=1e-5)
 
 

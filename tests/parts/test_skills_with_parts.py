@@ -8,7 +8,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from crane import ON, SMALL, Arm, Crane, Hook, crane, goes_on_and_loads
+from crane import ON, SMALL, Arm, Crane, Hook, acted, crane, goes_on_and_loads
+from playing import episode
 from small_runs import goes_on, reports_every
 
 import skillweave as sw
@@ -32,16 +33,12 @@ def on(kind: str = "box", masked: bool = False) -> Any:
     return sw.EnvSpec(functools.partial(Crane, kind, masked), engine="sync", workers=1)
 
 
-def actions_of(policy: Any, steps: int = 20) -> tuple[Any, list[str]]:
-    """Return the actions of an episode (steps, 3), and the skills that acted."""
-    env, player = Crane(), sw.Player(policy)
-    obs, _ = env.reset(seed=0)
-    acted = []
-    for _ in range(steps):
-        obs, *_ = env.step(player.act(obs))
-        acts = getattr(policy, "acts", None)
-        acted.append("" if acts is None else acts(player.memory))
-    return np.array(env.actions), acted
+def actions_of(policy: Any) -> tuple[Any, list[str]]:
+    """Return the actions of an episode (20, 3), and the skills that acted."""
+    player = sw.Player(policy)
+    told = [(action, policy.acts(player.memory)) for (action,) in episode(Crane(), player)]
+    actions, skills = zip(*told, strict=True)
+    return np.array(actions), list(skills)
 
 
 def in_turn(obs: Any) -> Any:
@@ -59,9 +56,9 @@ def test_each_skill_learns_on_its_own_numbers(learn):
     arm, hook = run.policy.skills.policies
     assert arm.algorithm.action_space.shape == (2,)
     assert hook.algorithm.observation_space.shape == (4,)
-    actions, acted = actions_of(run.policy)
-    assert acted == (["arm"] * 4 + ["hook"] * 4) * 2 + ["arm"] * 4
-    is_arm = np.array(acted) == "arm"
+    actions, names = actions_of(run.policy)
+    assert names == (["arm"] * 4 + ["hook"] * 4) * 2 + ["arm"] * 4
+    is_arm = np.array(names) == "arm"
     assert (actions[is_arm, 2] == 0).all()
     assert (actions[~is_arm, :2] == 0).all()
     assert actions[is_arm, :2].any()
@@ -86,12 +83,7 @@ def test_the_rest_is_held():
 @pytest.mark.parametrize("skill", ["arm", "hook"])
 def test_a_skill_alone_acts_as_in_the_hierarchy(skill):
     run = crane(selector=in_turn, rest="hold").train(quiet=True)
-    player = run.player(skill=skill)
-    env = Crane()
-    obs, _ = env.reset(seed=0)
-    for _ in range(5):
-        obs, *_ = env.step(player.act(obs))
-    actions = np.array(env.actions)
+    actions = acted(run.player(skill=skill))
     assert (actions[:, 2 if skill == "arm" else 0] == 0).all()
     assert actions.any()
 
@@ -226,8 +218,8 @@ def test_the_last_action_passes_into_a_hierarchy_below():
     inner.name = "inner"
     turns = functools.partial(named_turns, names=("swing", "inner"))
     run = crane([Swing(), inner], selector=turns, rest="hold").train(quiet=True)
-    actions, acted = actions_of(run.policy)
-    assert acted[4] == "inner/lower"
+    actions, names = actions_of(run.policy)
+    assert names[4] == "inner/lower"
     assert (actions[:4] == [0.25, 0.25, 0.0]).all()
     assert (actions[4:8] == [0.25, 0.25, -0.5]).all()
     assert (actions[8:12] == [0.25, 0.25, -0.5]).all()
@@ -360,12 +352,8 @@ def test_calls_come_first_and_the_rest_is_held_on(tmp_path):
 def test_masks_are_cut_to_the_part():
     run = crane([Arm(), type("Free", (sw.Skill,), {})()], env=on("several", True)).train(quiet=True)
     env = Crane("several", True)
-    player = run.player(skill="free")
-    obs, info = env.reset(seed=0)
-    for _ in range(10):
-        action = player.act(obs, info=info)
-        assert info["action_mask"][action[0]]
-        obs, *_, info = env.step(action)
+    for (action,) in episode(env, run.player(skill="free")):
+        assert env._info()["action_mask"][action[0]]
 
 
 def test_a_mask_that_forbids_the_rest_is_an_error():

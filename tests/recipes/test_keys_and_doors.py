@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
+from single_step import step_of
 
-from skillweave import Apart, Step, Together, envpool
-from skillweave.errors import DeclarationError, MissingExtra
+from skillweave import Apart, Together, envpool
 from skillweave.recipes import _rooms as world, keys_and_doors as rooms
 
 SKILLS = {s.name: s for s in (make() for make in rooms.SKILLS)}
@@ -21,12 +19,6 @@ def view(ahead=(world.EMPTY, 0, 0), hands=world.EMPTY, far=(world.EMPTY, 0, 0), 
     obs[0, 3, 5], obs[0, 3, 6, 0], obs[0, 1, 2] = ahead, hands, far
     obs[0, (2, 4), 6, 0] = sides
     return obs
-
-
-def step_of(before, action, after):
-    no = np.zeros(1, bool)
-    zero = np.zeros(1, np.float32)
-    return Step(before, np.array([action]), after, zero, no, no, no, np.ones(1, int), {})
 
 
 KEY, BALL, BOX = (world.KEY, 0, 0), (world.BALL, 1, 0), (world.BOX, 2, 0)
@@ -78,7 +70,7 @@ def test_a_skill_may_start_where_its_thing_is_in_view(seen, may):
     ],
 )
 def test_a_skill_ends_where_it_is_done_and_is_paid_for_it(name, before, action, after, done):
-    skill, step = SKILLS[name], step_of(before, action, after)
+    skill, step = SKILLS[name], step_of(before, after, action)
     assert skill.success(step).all() == done
     assert skill.termination(step).all() == done
     if done or name in ("drop", "next_room"):  # the others are paid for coming nearer, too
@@ -86,8 +78,8 @@ def test_a_skill_ends_where_it_is_done_and_is_paid_for_it(name, before, action, 
 
 
 def test_a_skill_that_shuts_a_door_pays_for_it():
-    shuts = step_of(view(OPEN), world.TOGGLE, view(CLOSED))
-    turns = step_of(view(OPEN), world.LEFT, view(CLOSED))  # to another door, which is shut
+    shuts = step_of(view(OPEN), view(CLOSED), world.TOGGLE)
+    turns = step_of(view(OPEN), view(CLOSED), world.LEFT)  # to another door, which is shut
     sees = 0.04 * (world.FAR - 1)  # a shut door is one step away now, and none was in view
     assert SKILLS["open_door"].reward(shuts) == pytest.approx(-1.02)
     assert SKILLS["open_door"].reward(turns) == pytest.approx(sees - 0.02)
@@ -95,19 +87,17 @@ def test_a_skill_that_shuts_a_door_pays_for_it():
 
 def test_a_skill_is_paid_for_each_cell_that_it_comes_nearer():
     far, near = view(far=GOAL), view(ahead=GOAL)  # two to the left and four ahead; one ahead
-    comes, goes = step_of(far, world.FORWARD, near), step_of(near, world.LEFT, far)
-    loses = step_of(near, world.LEFT, view())
     reward = SKILLS["reach_goal"].reward
-    assert reward(comes) == pytest.approx(5 * 0.04 - 0.02)
-    assert reward(goes) == pytest.approx(-5 * 0.04 - 0.02)
-    assert reward(loses) == pytest.approx(-(world.FAR - 1) * 0.04 - 0.02)
+    assert reward(step_of(far, near)) == pytest.approx(5 * 0.04 - 0.02)
+    assert reward(step_of(near, far)) == pytest.approx(-5 * 0.04 - 0.02)
+    assert reward(step_of(near, view())) == pytest.approx(-(world.FAR - 1) * 0.04 - 0.02)
 
 
 def test_explore_ends_where_there_is_something_to_do():
-    explore = SKILLS["explore"]
-    assert explore.termination(step_of(view(), world.FORWARD, view(far=CLOSED)))
-    assert not explore.termination(step_of(view(), world.FORWARD, view(far=LOCKED)))
-    assert not explore.termination(step_of(view(), world.FORWARD, view(far=OPEN)))
+    ends = SKILLS["explore"].termination
+    assert ends(step_of(view(), view(far=CLOSED)))
+    assert not ends(step_of(view(), view(far=LOCKED)))
+    assert not ends(step_of(view(), view(far=OPEN)))
 
 
 def test_explore_goes_in_looks_to_all_sides_goes_on_and_looks_again():
@@ -204,19 +194,6 @@ def test_rooms_are_drawn_anew_for_each_episode():
     assert all(world.SPACE.contains(obs) for obs in drawn)
     seen = set(np.unique([d[..., 0] for d in drawn]))
     assert {world.KEY, world.BALL, world.DOOR} <= seen
-
-
-def test_rooms_that_are_not_there_are_named_with_those_that_are():
-    with pytest.raises(
-        DeclarationError, match="no rooms 'cellar'; there are: small, unlock-pickup"
-    ):
-        world.spec("cellar")
-
-
-def test_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "minigrid", None)
-    with pytest.raises(MissingExtra, match=r"skillweave\[minigrid\]"):
-        world.Rooms(("Empty-5x5",))
 
 
 @pytest.mark.slow

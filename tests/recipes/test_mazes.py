@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from single_step import step_of
 
-from skillweave import Step
-from skillweave.errors import DeclarationError, MissingExtra
-from skillweave.recipes import _mazes as world, mazes, pick_and_place
+from skillweave.recipes import _mazes as world, mazes
 
 CORNER = np.array(
     [[1, 1, 1, 1, 1], [1, 0, 0, 0, 1], [1, 1, 1, 0, 1], [1, 0, 0, 0, 1], [1] * 5], bool
 )
 
 
+DIRECTIONS = [skill() for skill in mazes.SKILLS[:4]]
+
+
 def ball(place=(0.0, 0.0), speed=(0.0, 0.0), goal=(3.0, 4.0)):
     return np.array([[*place, *speed, *goal]], np.float32)
 
 
-def step_of(before, after, terminated=False):
-    no, end = np.zeros(1, bool), np.array([terminated])
-    action = np.zeros((1, 2), np.float32)
-    return Step(before, action, after, np.zeros(1, np.float32), end, no, no, np.ones(1, int), {})
-
-
 def test_directions_are_paid_for_speed_along_less_speed_across():
     rolling = step_of(ball(), ball(speed=(-1.0, 3.0)))
-    paid = {s.name: float(s.reward(rolling)[0]) for s in (m() for m in mazes.SKILLS[:4])}
+    paid = {s.name: float(s.reward(rolling)[0]) for s in DIRECTIONS}
     assert paid == {"north": 2.0, "east": -4.0, "south": -4.0, "west": -2.0}
 
 
@@ -45,7 +40,7 @@ def test_directions_are_paid_for_speed_along_less_speed_across():
     ],
 )
 def test_a_direction_ends_where_a_wall_is_in_the_way(before, after, ends):
-    for skill in (m() for m in mazes.SKILLS[:4]):
+    for skill in DIRECTIONS:
         step = step_of(ball(speed=before * skill.way), ball(speed=after * skill.way))
         assert not skill.termination(step), "a call has just begun"
         assert skill.termination(replace(step, elapsed=np.array([mazes.TRY]))) == ends
@@ -123,19 +118,6 @@ def test_the_picture_shows_walls_the_goal_and_the_ball_where_they_are():
     assert env.render_mode == "rgb_array"
 
 
-def test_a_maze_that_there_is_not_is_refused():
-    with pytest.raises(DeclarationError, match=r"no maze 'moon'; there are: large.*diverse"):
-        mazes.declare("moon")
-
-
-@pytest.mark.parametrize("recipe", [mazes, pick_and_place])
-def test_a_missing_extra_is_named_before_anything_is_trained(recipe, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
-    with pytest.raises(MissingExtra, match=r"skillweave\[robotics\]"):
-        recipe.declare().train(tmp_path / "run", quiet=True)
-    assert not (tmp_path / "run").exists()
-
-
 def rolled(selector, env, episodes):
     """The share of episodes that end at the goal under skills that know how to roll."""
     found = []
@@ -147,7 +129,7 @@ def rolled(selector, env, episodes):
             if name == "approach":
                 wanted = np.clip(4.0 * (obs[world.GOAL] - obs[world.PLACE]), -3.0, 3.0)
             else:
-                wanted = 3.0 * {s.name: s.way for s in mazes.SKILLS[:4]}[name]
+                wanted = 3.0 * {s.name: s.way for s in DIRECTIONS}[name]
             action = np.clip((wanted - obs[world.SPEED]) / 0.24, -1.0, 1.0).astype(np.float32)
             obs, reward, terminated, truncated, info = env.step(action)
             over = terminated or truncated

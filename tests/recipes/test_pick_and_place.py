@@ -7,8 +7,9 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
+from single_step import step_of
 
-from skillweave import Apart, Step
+from skillweave import Apart
 from skillweave.recipes import _arm as world, pick_and_place as arm
 
 
@@ -74,18 +75,16 @@ def observation(
     return obs
 
 
-@pytest.mark.parametrize(
-    ("offset", "fingers", "skill"),
-    [
-        ((0.1, 0.0, -0.1), 0.1, "above"),
-        ((0.01, 0.0, -0.1), 0.1, "descend"),
-        ((0.01, 0.0, -0.01), 0.1, "close"),
-        ((0.01, 0.0, -0.01), 0.05, "carry"),
-        ((0.1, 0.0, -0.1), 0.05, "above"),  # the fingers are closed on nothing
-    ],
-)
-def test_the_rule_chooses_by_where_the_block_is(offset, fingers, skill):
-    assert arm.rule(observation(offset=offset, fingers=fingers)).tolist() == [skill]
+FAR = observation(offset=(0.1, 0.0, -0.1))
+OVER = observation(offset=(0.01, 0.0, -0.1))
+AROUND = observation(offset=(0.01, 0.0, -0.01))
+HELD = observation(offset=(0.01, 0.0, -0.01), fingers=0.05)
+SHUT = observation(offset=(0.1, 0.0, -0.1), fingers=0.05)  # on nothing
+
+
+def test_the_rule_chooses_by_where_the_block_is():
+    chosen = arm.rule(np.concatenate([FAR, OVER, AROUND, HELD, SHUT]))
+    assert chosen.tolist() == ["above", "descend", "close", "carry", "above"]
 
 
 def test_functions_move_towards_what_they_are_for():
@@ -100,16 +99,11 @@ def test_functions_move_towards_what_they_are_for():
 def test_recovering_is_paid_by_progress_to_the_block():
     before, after = observation(offset=(0.3, 0.4, 0.0)), observation(offset=(0.0, 0.2, 0.0))
     there = observation(offset=(0.0, 0.0, 0.0))
-    no, one = np.zeros(1, bool), np.ones(1, np.int64)
-
-    def step(a, b):
-        return Step(a, np.zeros((1, 4)), b, np.zeros(1), no, no, no, one, {})
-
-    skill = arm.Recover()
-    assert skill.reward(step(before, after)) == pytest.approx(10 * 0.3)
-    assert skill.reward(step(after, there)) == pytest.approx(10 * 0.2 + 1.0)
-    assert skill.termination(step(after, there))
-    assert not skill.termination(step(before, after))
+    comes, arrives, skill = step_of(before, after), step_of(after, there), arm.Recover()
+    assert skill.reward(comes) == pytest.approx(10 * 0.3)
+    assert skill.reward(arrives) == pytest.approx(10 * 0.2 + 1.0)
+    assert skill.termination(arrives)
+    assert not skill.termination(comes)
 
 
 @pytest.fixture
@@ -177,12 +171,9 @@ def test_a_gripper_slips_once_after_it_has_taken_hold_and_drops_the_block(distur
 
 
 def test_skills_may_start_where_they_make_sense():
-    far, over = observation(offset=(0.1, 0.0, -0.1)), observation(offset=(0.01, 0.0, -0.1))
-    around = observation(offset=(0.01, 0.0, -0.01))
-    held = observation(offset=(0.01, 0.0, -0.01), fingers=0.05)
     skills = arm.hierarchy.skills
     assert [s.name for s in skills] == ["above", "descend", "close", "carry", "recover"]
-    allowed = [[bool(s.initiation(o)[0]) for s in skills] for o in (far, over, around, held)]
+    allowed = [[bool(s.initiation(o)[0]) for s in skills] for o in (FAR, OVER, AROUND, HELD)]
     assert allowed == [
         [True, False, False, False, True],
         [True, True, False, False, True],
@@ -192,21 +183,16 @@ def test_skills_may_start_where_they_make_sense():
 
 
 def test_calls_end_where_there_is_nothing_left_to_do():
-    far, over = observation(offset=(0.1, 0.0, -0.1)), observation(offset=(0.01, 0.0, -0.1))
-    around = observation(offset=(0.01, 0.0, -0.01))
-    held = observation(offset=(0.01, 0.0, -0.01), fingers=0.05)
-    no, one = np.zeros(1, bool), np.ones(1, np.int64)
-
     def ends(skill, after):
-        step = Step(far, np.zeros((1, 4)), after, np.zeros(1), no, no, no, one, {})
+        step = step_of(FAR, after)
         return bool(skill.termination(step)[0]), bool(skill.success(step)[0])
 
     above, descend, close, carry, _ = arm.hierarchy.skills
-    assert [ends(above, o) for o in (far, over)] == [(False, False), (True, True)]
-    after = [ends(descend, o) for o in (far, over, around)]
+    assert [ends(above, o) for o in (FAR, OVER)] == [(False, False), (True, True)]
+    after = [ends(descend, o) for o in (FAR, OVER, AROUND)]
     assert after == [(True, False), (False, False), (True, True)]
-    assert [ends(close, o) for o in (around, held)] == [(False, False), (True, True)]
-    assert [ends(carry, o) for o in (held, around)] == [(False, False), (True, False)]
+    assert [ends(close, o) for o in (AROUND, HELD)] == [(False, False), (True, True)]
+    assert [ends(carry, o) for o in (HELD, AROUND)] == [(False, False), (True, False)]
 
 
 @pytest.mark.slow

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from single_step import step_of
 
 from skillweave import recipes
 from skillweave.errors import DeclarationError
-from skillweave.types import Step
 from skillweave.workers import shipping
 from skillweave.workers.shipping import packed
 
@@ -62,10 +62,7 @@ def write(tmp_path: Path) -> Write:
 def test_files_beside_a_recipe_are_imported_also_later(write: Write) -> None:
     recipe = write("a", pole=RECIPE, beside_rewards=REWARDS, beside_lazily="scale = 2.0\n")
     (center,) = recipes.load(recipe).skills
-    no = np.zeros(1, bool)
-    step = Step(
-        np.zeros((1, 4)), no, np.full((1, 4), 0.25), np.zeros(1), no, no, no, np.ones(1), {}
-    )
+    step = step_of(np.zeros((1, 4)), np.full((1, 4), 0.25))
     assert center.reward(step).tolist() == [1.5]
 
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-
 import gymnasium as gym
 import numpy as np
 import pytest
+from single_step import step_of
 from toys import SideBySide
 
 from benchmarks.pay.shuttle import POINTS, suite as shuttle_suite
-from skillweave import SkillweaveError, Step
+from skillweave import SkillweaveError
 from skillweave.recipes import _cheetah as cheetah, shuttle
 
 COST = -0.25
@@ -83,33 +82,22 @@ def test_points_that_make_no_patrol_are_refused(points):
         cheetah.Patrol(Runner([]), points)
 
 
-def step_of(x, next_x, leg, next_leg, action=0.5):
-    def obs(x, leg):
-        return np.array([[x, *np.zeros(8), 2.0, *np.zeros(8), *(np.arange(3) == leg)]], np.float32)
-
-    no, one = np.zeros(1, bool), np.ones(1, np.int64)
-    actions = np.full((1, 6), action, np.float32)
-    return Step(obs(x, leg), actions, obs(next_x, next_leg), np.zeros(1), no, no, no, one, {})
+def seen(x, leg):
+    """An observation at 2 m/s."""
+    return np.array([[x, *np.zeros(8), 2.0, *np.zeros(8), *(np.arange(3) == leg)]], np.float32)
 
 
 def test_skills_are_paid_for_speed_less_effort_and_for_the_end_of_a_leg():
-    # At 2 m/s; the effort is 0.1·6·0.5² = 0.15.
-    going = step_of(1.0, 1.1, 0, 0)
+    pushes = np.full(6, 0.5)  # the effort is 0.1·6·0.5² = 0.15
+    going = step_of(seen(1.0, 0), seen(1.1, 0), pushes)
     assert shuttle.Forward().reward(going) == pytest.approx(2.0 - 0.15, abs=1e-4)
     assert shuttle.Backward().reward(going) == pytest.approx(-2.0 - 0.15, abs=1e-4)
     assert shuttle.Stop().reward(going) == pytest.approx(-2.0 - 0.15, abs=1e-4)
     assert not shuttle.Forward().termination(going)
-    there = step_of(1.95, 2.05, 0, 1)
+    there = step_of(seen(1.95, 0), seen(2.05, 1), pushes)
     # The prize is 400, less 80 for each of the 2 m/s.
     assert shuttle.Forward().reward(there) == pytest.approx(1.85 + 240.0, abs=1e-2)
     assert shuttle.Forward().termination(there)
-
-
-def test_a_missing_extra_is_named_before_anything_is_trained(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(SkillweaveError, match=r"skillweave\[mujoco\]"):
-        shuttle.declare().train(tmp_path / "run", quiet=True)
-    assert not (tmp_path / "run").exists()
 
 
 def test_the_half_cheetah_itself_has_the_papers_observations_rewards_and_length():

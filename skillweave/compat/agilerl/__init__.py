@@ -1,12 +1,30 @@
 """AgileRL 0.1's module paths and names on Skillweave; docs/from-agilerl.md has the differences."""
 
 import functools
+import os
+import sys
 import warnings
 from typing import Any
 
 import gymnasium as gym
 
-from skillweave.compat.wandb_runs import stay_offline
+from skillweave._internal.terminal import say
+from skillweave.runs.trackers import wandb_mode
+
+_messages: list[str] = []
+"""What has not been printed yet."""
+
+
+def stay_offline() -> None:
+    """Set wandb to offline if the user has no login, so that it does not request one.
+
+    A line on stderr reports it, once, when wandb is imported.
+    """
+    if "WANDB_MODE" not in os.environ and wandb_mode() == "offline":
+        os.environ["WANDB_MODE"] = "offline"
+        _messages.append("no login to Weights & Biases, so its runs stay offline")
+    if "wandb" in sys.modules and _messages:
+        say(f"skillweave: {_messages.pop()}")
 
 
 def _make(name: str, **kwargs: Any) -> gym.Env[Any, Any]:

@@ -1,13 +1,18 @@
 """The agents: AgileRL's names and signatures, on the native API."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
+import torch
 
 from skillweave.algorithms import config
-from skillweave.compat.agilerl.agent import MLP, Agent, Setting
+from skillweave.algorithms.batches import Rollout
+from skillweave.compat.agilerl.agent import MLP, Agent, Setting, tensor_of
+from skillweave.compat.numpy_actor import NumpyActor
 from skillweave.errors import DeclarationError
+from skillweave.evolution.stacks import Member
+from skillweave.spaces import to_tensor
 from skillweave.types import Array
 
 
@@ -16,6 +21,12 @@ class PPO(Agent):
 
     algo = "PPO"
     kind = config.PPO
+    fixed: ClassVar[dict[str, Any]] = {
+        "learning_rate_schedule": "constant",
+        "num_envs": 1,
+        "n_steps": 2**31,
+        "min_advantage_std": 0.0,  # AgileRL has no such limit
+    }
     lr, gae_lambda, clip_coef = map(Setting, ("learning_rate", "gae_lambda", "clip_coef"))
     ent_coef, vf_coef, max_grad_norm = map(Setting, ("ent_coef", "vf_coef", "max_grad_norm"))
     target_kl = Setting("target_kl")
@@ -50,25 +61,61 @@ class PPO(Agent):
     ) -> None:
         actions: gym.Space[Any] = gym.spaces.Box(-np.inf, np.inf, (action_dim,), np.float32)
         actions = gym.spaces.Discrete(action_dim) if discrete_actions else actions
-        settings = {"learning_rate_schedule": "constant", "adam_eps": 1e-8, "num_envs": 1}
-        settings["min_advantage_std"] = 0.0  # AgileRL has no such limit
-        self._start(locals(), actions, n_steps=2**31, normalize_obs=False, **settings)
+        self._start(locals(), actions, adam_eps=1e-8)
+
+    def become(self, member: Member) -> None:
+        """Continue as another member; see the base."""
+        super().become(member)
+        self.actor = NumpyActor(self.learner, member.state)
 
     def getAction(self, state: Any, action: Any = None, grad: bool = False) -> tuple[Array, ...]:
         """Sample actions int64 (B,) or float32 (B, A); log-probabilities, entropies, values."""
         if action is not None or grad:
             raise DeclarationError("getAction(action=, grad=) is a part of learning: use learn()")
-        return self.native.sample(state)
+        return self.actor.sample(self.rows(state), self.rng)
 
     def learn(self, experiences: Any, noise_clip: float = 0.5, policy_noise: float = 0.2) -> float:
         """Learn from T states, actions, log-probabilities, rewards, terminations and values.
 
         Last come the observations (N, ...) after the last step. Returns the loss.
         """
-        *steps, _, after = experiences
-        losses = self.native.learn_steps(*steps, after)
+        self.updates += 1
+        rng = [(self.seeds / "update" / self.updates).torch()]
+        _, report = self.learner.update(self.member.state, self.rollout(experiences), rng)
+        self.actor = NumpyActor(self.learner, self.member.state)
+        losses = {k: float(v) for k, v in report.metrics.items()}
         value_part = self.vf_coef * losses["value_loss"] - self.ent_coef * losses["entropy"]
         return float(losses["policy_loss"] + value_part)
+
+    def rollout(self, experiences: Any) -> Rollout:
+        """Return what ``learn`` takes, of N environments, as a rollout.
+
+        The successor of a step is the next entry of the states. Actions are in policy units, and
+        count as drawn with the log-probabilities given.
+        """
+        states, action, log_prob, reward, ended, _, after = experiences
+        learner, member_state = self.learner, self.member.state
+        rewards = tensor_of(reward, np.float32)
+        lead = 1, len(rewards), max(1, rewards[0].numel())
+        obs = to_tensor(self.rows(states)).unflatten(0, lead)
+        ends = tensor_of(ended, bool).view(lead)
+        last = ends.clone()
+        last[:, -1] = True
+        kind = np.int64 if learner.codec.discrete else np.float32
+        actions = tensor_of(action, kind).view(*lead, *(self.spaces[1].shape or ()))
+        log_std = learner.layout.views(member_state.params).get("actor.log_std")
+        log_std = None if log_std is None else log_std[:, None].clone()
+        log_probs = tensor_of(log_prob, np.float32).view(lead)
+        return Rollout(
+            obs,
+            actions,
+            rewards.view(lead),
+            member_state.gamma[:, None, None] * ~ends,
+            torch.cat([obs[:, 1:], to_tensor(self.rows(after))[None, None]], 1),
+            last,
+            dist_params=learner.head.with_log_prob(actions, log_probs, log_std),
+            log_std=log_std,
+        )
 
 
 class DQN(Agent):
@@ -104,11 +151,11 @@ class DQN(Agent):
 
     def getAction(self, state: Any, epsilon: float = 0, action_mask: Any = None) -> Array:
         """Return actions (B,) int64: any allowed one with probability ``epsilon``, or the best."""
-        return self.native.act(state, explore=False, epsilon=epsilon, mask=action_mask)
+        return self.act(state, explore=False, epsilon=epsilon, mask=action_mask)
 
     def learn(self, experiences: Any) -> float:
         """Make one gradient step; return the loss."""
-        return self.native.learn_sample(self.gamma, *experiences[:5])[0]["loss"]
+        return self.learn_sample(self.gamma, experiences[:5])[0]["loss"]
 
 
 class RainbowDQN(Agent):
@@ -156,7 +203,7 @@ class RainbowDQN(Agent):
 
     def getAction(self, state: Any, action_mask: Any = None, training: bool = True) -> Array:
         """Return the best actions (B,) int64; with noise in the weights while ``training``."""
-        return self.native.act(state, explore=training, mask=action_mask)
+        return self.act(state, explore=training, mask=action_mask)
 
     def learn(self, experiences: Any, n_step: bool = False, per: bool = False) -> Any:
         """Make one gradient step; return the loss, the samples' indices and their new priorities.
@@ -164,13 +211,10 @@ class RainbowDQN(Agent):
         After the five of every sample come, with ``per``, weights and indices; with ``n_step``
         the five again, summed over n steps: only these are learnt from then.
         """
-        used = experiences[:5]
-        gamma = self.gamma
-        if n_step:
-            used = experiences[-5:]
-            gamma = gamma**self.n_step
+        used = experiences[-5:] if n_step else experiences[:5]
+        gamma = self.gamma**self.n_step if n_step else self.gamma
         weights = experiences[5] if per else None
-        metrics, errors = self.native.learn_sample(gamma, *used, weights)
+        metrics, errors = self.learn_sample(gamma, used, weights)
         if not per:
             return metrics["loss"], None, None
         return metrics["loss"], experiences[6], errors + self.prior_eps
@@ -181,10 +225,9 @@ class TD3(Agent):
 
     algo = "TD3"
     kind = config.TD3
-    twin = True
+    fixed: ClassVar[dict[str, Any]] = {"twin": True, "n_step": 1, "action_l2": 0.0}
     lr_critic = Setting("learning_rate")
     policy_freq = Setting("policy_delay")
-    lr_actor = Setting("actor_rate", share="learning_rate")
     tau = Setting("tau")
     learn_step = Setting("update_ratio", inverse=True)
 
@@ -212,27 +255,30 @@ class TD3(Agent):
         accelerator: Any = None,
         wrap: bool = True,
     ) -> None:
-        # In place of the Setting of lr_actor alone: a share needs both rates.
-        settings = {
-            "actor_rate": lr_actor / lr_critic,
-            "twin": self.twin,
-            "n_step": 1,
-            "action_l2": 0.0,
-        }
-        settings |= {"exploration_noise": 2.0 * expl_noise / (max_action - min_action)}
         actions = gym.spaces.Box(min_action, max_action, (action_dim,), np.float32)
-        self._start(locals(), actions, **settings)
+        noise = 2.0 * expl_noise / (max_action - min_action)
+        rate = lr_actor / lr_critic
+        self._start(locals(), actions, exploration_noise=noise, actor_rate=rate)
+
+    @property
+    def lr_actor(self) -> float:
+        """Return the actor's learning rate."""
+        return float(self.lr_critic * self.member.config.actor_rate)
+
+    @lr_actor.setter
+    def lr_actor(self, value: float) -> None:
+        self.set(actor_rate=value / self.lr_critic)
 
     def getAction(self, state: Any, epsilon: float = 0) -> Array:
         """Return actions (B, A) float32: random with probability ``epsilon``, or noisy."""
-        return self.native.act(state, epsilon=epsilon)
+        return self.act(state, epsilon=epsilon)
 
     def learn(self, experiences: Any, noise_clip: float = 0.5, policy_noise: float = 0.2) -> Any:
         """Make one gradient step; return the losses of actor (or None) and critics."""
-        state = self.native.member.state
+        state = self.member.state
         state.target_noise.fill_(policy_noise)
         state.target_noise_clip.fill_(noise_clip)
-        metrics, _ = self.native.learn_sample(self.gamma, *experiences[:5])
+        metrics, _ = self.learn_sample(self.gamma, experiences[:5])
         due = int(state.updates[0]) % self.policy_freq == 0
         return metrics["policy_loss"] if due else None, metrics["critic_loss"]
 
@@ -241,7 +287,7 @@ class DDPG(TD3):
     """A DDPG agent: one critic."""
 
     algo = "DDPG"
-    twin = False
+    fixed = TD3.fixed | {"twin": False}
 
     def __init__(
         self,
@@ -269,3 +315,7 @@ class DDPG(TD3):
     ) -> None:
         given = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         super().__init__(**{k.replace("c_network", "c_networks"): v for k, v in given.items()})
+
+
+KINDS: dict[str, Any] = {kind.algo: kind for kind in (PPO, DQN, RainbowDQN, DDPG, TD3)}
+"""The agents, by their names in AgileRL."""

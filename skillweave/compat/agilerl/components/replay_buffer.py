@@ -2,16 +2,22 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+import torch
 
-from skillweave.algorithms.batches import Sample
+from skillweave.algorithms.batches import Batch, Sample
+from skillweave.buffers.replay import ReplayStore
 from skillweave.compat.agilerl.agent import random_seed
-from skillweave.compat.transition_buffer import TransitionBuffer
+from skillweave.ops.device import FLOAT
 from skillweave.types import Array
 
 
 class MultiStepReplayBuffer:
-    """Transitions whose rewards are summed over ``n_step`` steps, sampled evenly."""
+    """Transitions whose rewards are summed over ``n_step`` steps, sampled evenly.
+
+    Where a state is not the successor of the one before, the episode counts as cut there.
+    """
 
     def __init__(
         self,
@@ -26,15 +32,46 @@ class MultiStepReplayBuffer:
     ) -> None:
         self.memory_size = memory_size
         self.counter = 0
-        self.native = TransitionBuffer(memory_size, random_seed(), gamma, n_step=n_step, **how)
+        self._gamma = torch.tensor([gamma], **FLOAT)
+        self._how = {"n_step": n_step, **how}
+        self._rngs = [np.random.default_rng(random_seed())]
+        self._store: ReplayStore | None = None  # made when the first transitions are added
+        self._after = np.empty(0)
 
     def __len__(self) -> int:
-        return len(self.native)
+        return len(self._store) if self._store else 0
+
+    @property
+    def _filled(self) -> ReplayStore:
+        assert self._store, "sample() before add()"
+        return self._store
 
     def save2memory(self, *args: Any, is_vectorised: bool = False) -> Any:
         """Add state, action, reward, next state, termination: of one environment or of each."""
-        self.native.add(*(np.asarray(x) if is_vectorised else np.asarray(x)[None] for x in args))
-        self.counter += len(args[0]) if is_vectorised else 1
+        before, action, reward, after, ended = (
+            np.asarray(x) if is_vectorised else np.asarray(x)[None] for x in args
+        )
+        n = len(before)
+        if self._store is None:
+            kind: Any = before.dtype if before.dtype.kind in "iu" else np.float32
+            space: gym.Space[Any] = gym.spaces.Box(0, 1, before.shape[1:], kind)
+            size, shape = self.memory_size, action.shape[1:]
+            self._store = ReplayStore(size, n, 1, space, shape, action.dtype, **self._how)
+        elif not np.array_equal(before, self._after):
+            self._store.cut(np.arange(n))
+        self._after = after
+        self._store.add(
+            Batch(
+                obs=before[None],
+                action=action[None],
+                reward=reward.astype(np.float32)[None],
+                steps=np.ones((1, n), np.int64),
+                terminated=ended.astype(bool)[None],
+                truncated=np.zeros((1, n), bool),
+                next_obs=after[None],
+            )
+        )
+        self.counter += n
         return args
 
     def save2memoryVectEnvs(self, *args: Any) -> Any:
@@ -45,12 +82,15 @@ class MultiStepReplayBuffer:
 
     def sample(self, batch_size: int, return_idx: bool = False) -> tuple[Any, ...]:
         """Return states, actions, rewards, next states, terminations: float32 tensors (B, ...)."""
-        sample = self.native.sample(batch_size)
+        sample = self._drawn(batch_size)
         return (*_parts(sample), sample.index[0]) if return_idx else _parts(sample)
+
+    def _drawn(self, batch_size: int, beta: float = 1.0) -> Sample:
+        return self._filled.sample(batch_size, self._gamma, self._rngs, min(1.0, beta))
 
     def sample_from_indices(self, idxs: Array) -> tuple[Any, ...]:
         """Return the transitions at the indices of a sample from another buffer."""
-        return _parts(self.native.at(idxs))
+        return _parts(self._filled.at(np.asarray(idxs)[None], None, self._gamma))
 
 
 class ReplayBuffer(MultiStepReplayBuffer):
@@ -81,12 +121,12 @@ class PrioritizedReplayBuffer(MultiStepReplayBuffer):
 
     def sample(self, batch_size: int, beta: float = 0.4) -> tuple[Any, ...]:
         """Return transitions as the other buffers do, then importance weights (B,) and indices."""
-        sample = self.native.sample(batch_size, beta)
+        sample = self._drawn(batch_size, beta)
         return (*_parts(sample), sample.weight[0], sample.index[0])  # type: ignore[index]
 
     def update_priorities(self, idxs: Array, priorities: Array) -> None:
         """Set the priorities of sampled transitions."""
-        self.native.update_priorities(idxs, priorities)
+        self._filled.update_priorities(np.asarray(idxs)[None], torch.as_tensor(priorities)[None])
 
 
 def _parts(sample: Sample) -> tuple[Any, ...]:

@@ -6,7 +6,9 @@ import numpy as np
 
 from skillweave.compat.agilerl.agent import random_seed
 from skillweave.errors import DeclarationError
+from skillweave.evolution.architecture import check_architecture
 from skillweave.evolution.config import KINDS, Mutations as Native, Range
+from skillweave.evolution.mutation import mutate
 
 _WORDS = {
     "none": "None",
@@ -65,11 +67,12 @@ class Mutations:
         for i, agent in enumerate(population if kinds.any() else ()):
             agent.mut = "None"
             if i > 0 or self.mutate_elite:
-                settings = agent.native.member.config
-                ranges = {k: r for k, r in self._ranges.items() if hasattr(settings, k)}
+                config = agent.member.config
+                ranges = {k: r for k, r in self._ranges.items() if hasattr(config, k)}
                 chances = dict(zip(KINDS, (kinds / kinds.sum()).tolist(), strict=True))
-                change = agent.native.mutate(
-                    Native(**chances, ranges=ranges, **self._how), self.rng
-                )
+                by = Native(**chances, ranges=ranges, **self._how)
+                check_architecture(config, by, "Mutations: ")
+                agent.become(mutate(agent.member, by, agent.spaces, self.rng))
+                change = agent.member.origin
                 agent.mut = _WORDS.get(change.mutation) or _WORDS[next(iter(change.changes))]
         return population

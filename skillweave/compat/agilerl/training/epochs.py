@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from skillweave.compat.agilerl import stay_offline
 from skillweave.compat.agilerl.agent import swapped
-from skillweave.compat.wandb_runs import start_wandb
-from skillweave.errors import DeclarationError
+from skillweave.errors import DeclarationError, needs_extra
 
 Result = tuple[list[Any], list[list[float]]]
 
@@ -31,9 +31,7 @@ class Epochs(SimpleNamespace):
             raise DeclarationError("env must reset in the same step: make it with makeVectEnvs")
         name = f"{self.env_name}-EvoHPO-{self.algo}"
         scores = []
-        settings = {**(self.INIT_HP or {}), **(self.MUT_P or {})}
-        key = self.wandb_api_key
-        self.tracked = start_wandb("AgileRL", name, settings, key) if self.wb else None
+        self.tracked = self._wandb_run(name) if self.wb else None
         for number in range(1, self.n_episodes + 1):
             losses = [self._scored(agent, episode(agent, number - 1)) for agent in self.pop]
             if number % self.evo_epochs == 0:
@@ -70,6 +68,18 @@ class Epochs(SimpleNamespace):
             self.ended.append(ended)
             yield state, acted, reward, after, ended
             state = after
+
+    def _wandb_run(self, name: str) -> Any:
+        """Start a run of Weights & Biases; offline without login or key."""
+        with needs_extra("tracking with wandb", "wandb"):
+            import wandb
+        stay_offline()
+        key = self.wandb_api_key
+        if key is not None:
+            wandb.login(key=key)
+        settings = {**(self.INIT_HP or {}), **(self.MUT_P or {})}
+        mode: Any = None if key is None else "online"
+        return wandb.init(project="AgileRL", name=name, config=settings, mode=mode)
 
     def _scored(self, agent: Any, loss: Any) -> Any:
         """Record the mean return of the first episodes of all environments."""

@@ -6,11 +6,9 @@ from typing import Any
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from skillweave._internal.messages import suggest
-from skillweave.compat.agilerl.agents import DDPG, DQN, PPO, TD3, RainbowDQN
+from skillweave.compat.agilerl.agents import KINDS
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
-
-_KINDS: dict[str, Any] = {kind.algo: kind for kind in (PPO, DQN, RainbowDQN, DDPG, TD3)}
 
 
 def makeVectEnvs(env_name: str, num_envs: int = 1) -> SyncVectorEnv:
@@ -47,15 +45,15 @@ def initialPopulation(
         DeclarationError: no such algorithm, or a setting without a default is missing.
     """
     given = locals() | {"critic_networks": critic_network}
-    if algo not in _KINDS:
-        raise DeclarationError(f"no algorithm {algo!r} here{suggest(algo, _KINDS)}")
-    known = inspect.signature(_KINDS[algo]).parameters
+    if algo not in KINDS:
+        raise DeclarationError(f"no algorithm {algo!r} here{suggest(algo, KINDS)}")
+    known = inspect.signature(KINDS[algo]).parameters
     settings = {k: INIT_HP[k.upper()] for k in known if k.upper() in INIT_HP}
     settings |= {k: v for k, v in given.items() if k in known}
     missing = [k.upper() for k, p in known.items() if p.default is p.empty and k not in settings]
     if missing:
         raise DeclarationError(f"INIT_HP has no {', '.join(missing)}, which {algo} needs")
-    return [_KINDS[algo](**settings | {"index": i}) for i in range(population_size)]
+    return [KINDS[algo](**settings | {"index": i}) for i in range(population_size)]
 
 
 make_vect_envs = makeVectEnvs

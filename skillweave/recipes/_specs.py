@@ -1,0 +1,33 @@
+"""What several recipes do with their environments and skills."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium as gym
+
+from skillweave import EnvSpec, Hierarchy
+
+
+def named(name: str, make: Callable[..., gym.Env[Any, Any]], pool: Any = None) -> EnvSpec:
+    """Return environments under a name of their own in runs, for ``Hierarchy(env=...)``.
+
+    Args:
+        make: takes ``render_mode``.
+        pool: makes them side by side; see ``EnvSpec``.
+    """
+
+    def one(render_mode: str | None = None) -> gym.Env[Any, Any]:
+        return make(render_mode=render_mode)
+
+    one.__name__ = name
+    return EnvSpec(one, pool=pool)
+
+
+def given(hierarchy: Hierarchy, skills: Mapping[str, Any]) -> Hierarchy:
+    """Return the hierarchy with policies of its skills, by name; only the selector learns."""
+    for skill in hierarchy.skills:
+        skill.policy = skills[skill.name]
+        skill.steps = None  # it is not trained
+    return hierarchy
