@@ -294,9 +294,7 @@ def summary(results: Sequence[Result], out: Path) -> tuple[dict[str, Any], str]:
         if returns:
             over = over_seeds(np.array(returns))
             group |= {"iqm": float(over.mean), "median": statistics.median(returns)}
-            group |= {"least": min(returns), "most": max(returns)}
-            if over.low is not None and over.high is not None:
-                group |= {"low": float(over.low), "high": float(over.high)}
+            group |= {"least": min(returns), "most": max(returns)} | over.bounds
         groups.append(group)
     result = {"out": str(out), "groups": groups, "runs": runs, "failed": failed}
     return result, "\n".join([*_table(groups), *_failures(failed), f"runs    {out}"])

@@ -142,11 +142,9 @@ def test_an_environment_without_pictures_has_no_film_and_all_the_rest(tmp_path: 
 
 def test_interquartile_means_and_intervals_over_seeds() -> None:
     alone = over_seeds(np.array([[1.0, 2.0]]))
-    assert (alone.mean.tolist(), alone.low, alone.high) == ([1, 2], None, None)
+    assert (alone.mean.tolist(), alone.low.tolist(), alone.bounds) == ([1, 2], [1, 2], {})
     many = np.random.default_rng(0).normal(5, 1, (40, 3))
     found = over_seeds(many)
-    assert found.low is not None
-    assert found.high is not None
     ordered = np.sort(many, axis=0)[10:30].mean(axis=0)
     np.testing.assert_allclose(found.mean, ordered)
     assert (found.low < found.mean).all()
@@ -155,14 +153,14 @@ def test_interquartile_means_and_intervals_over_seeds() -> None:
     width = (found.high - found.low) / 2
     assert ((width > 0.2) & (width < 0.6)).all()
     same = over_seeds(np.full(5, 3.0))
-    assert (same.mean, same.low, same.high) == (3, 3, 3)
+    assert (same.mean, same.bounds) == (3, {"low": 3, "high": 3})
 
 
 def test_groups_of_one_seed_have_no_interval_to_draw() -> None:
     dot, bar = {"group": "A", "x": 1.0, "seed": 0}, {"group": "A", "x": 1.0}
-    alone = scores("A", ["#000"], {"dots": [dot], "bars": [bar]})
+    alone = scores("A", ["#000"], [dot], [bar])
     assert [layer["mark"]["type"] for layer in alone["layer"]] == ["point", "tick"]
-    several = scores("A", ["#000"], {"dots": [dot], "bars": [bar | {"low": 0.0, "high": 2.0}]})
+    several = scores("A", ["#000"], [dot], [bar | {"low": 0.0, "high": 2.0}])
     assert [layer["mark"]["type"] for layer in several["layer"]] == ["rule", "point", "tick"]
 
 

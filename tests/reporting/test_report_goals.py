@@ -11,11 +11,26 @@ import numpy as np
 import pytest
 from goals.worlds import SPACES, Drawn, GoTo, Rest, aim_of, declared
 
+from skillweave import Run
 from skillweave.reporting.report.calls import decision_data
 from skillweave.reporting.report.charts import choices
-from skillweave.reporting.report.handover import handover_section
-from skillweave.reporting.report.single import play_episodes
+from skillweave.reporting.report.handover import add_handover
+from skillweave.reporting.report.page import Page
+from skillweave.reporting.report.single import Played, play_episodes
 from skillweave.skills.goal_spaces import shown_goal
+
+
+def play(run: Run, episodes: int, num_envs: int = 2) -> tuple[Page, Played]:
+    page = Page()
+    return page, play_episodes(
+        page, run.policy, run.declaration.spec, episodes, 0, 0, True, num_envs
+    )
+
+
+def handover(*given: Any) -> dict[str, Any]:
+    page = Page()
+    add_handover(page, *given, filmed=True)
+    return page.data["handover"]["cells"]
 
 
 def walks(name: str, space: Any, left: float = 1.0) -> Any:
@@ -45,8 +60,8 @@ def test_each_kind_of_goals_has_its_picture(tmp_path: Path) -> None:
         walks("other", SPACES["dict"]),
     ]
     run = declared(skills, selector=chosen).train(tmp_path / "run", quiet=True)
-    played = play_episodes(run.policy, run.declaration.spec, 30, 0, 0, True, 4)
-    found = {picture["name"]: picture for picture in played.section.context["goals"]}
+    page, played = play(run, 30, 4)
+    found = {picture["name"]: picture for picture in page.context["goals"]}
     assert set(found) == {"two", "number", "one"}  # goals of a Dict have none
     for name, picture in found.items():
         rows = picture["spec"]["data"]["values"]
@@ -72,9 +87,9 @@ def test_each_call_has_its_goal_in_words(tmp_path: Path) -> None:
         return names, {"two": obs.clip(-1, 1), "number": np.full(len(obs), 3)}
 
     run = declared([two, number, Rest()], selector=selector).train(tmp_path / "run", quiet=True)
-    played = play_episodes(run.policy, run.declaration.spec, 12, 0, 0, True, 4)
+    page, played = play(run, 12, 4)
     seen = set()
-    for shown, episode in zip(played.section.data["episodes"], played.log.episodes, strict=True):
+    for shown, episode in zip(page.data["episodes"], played.log.episodes, strict=True):
         for words, call in zip(shown["calls"]["goal"], episode.calls, strict=True):
             skill = played.log.labels[call["skill"]]
             goal = shown_goal(call["start"].clip(-1, 1)) if skill == "two" else "3"
@@ -112,8 +127,7 @@ def test_the_map_of_goals_shows_their_whole_range(tmp_path: Path) -> None:
         return ["two"] * len(obs), np.zeros((len(obs), 2))
 
     run = declared([walks("two", SPACES["box"])], selector=selector).train(tmp_path / "run")
-    played = play_episodes(run.policy, run.declaration.spec, 4, 0, 0, True, 2)
-    encoding = played.section.context["goals"][0]["spec"]["encoding"]
+    encoding = play(run, 4)[0].context["goals"][0]["spec"]["encoding"]
     assert [encoding[axis]["scale"]["domain"] for axis in "xy"] == [[-1, 1], [-1, 1]]
 
 
@@ -129,8 +143,8 @@ def test_films_of_handovers_and_choices_name_goals(tmp_path: Path) -> None:
     run = declared(skills, env=Drawn, selector=selector).train(tmp_path / "run", quiet=True)
     log, spec = run.log_calls(400, num_envs=2), run.declaration.spec
     with_goals = {skill.name: skill for skill in skills[:2]}
-    section = handover_section(log, spec, {}, with_goals, filmed=True)
-    clips = [(c, clip) for c in section.data["handover"]["cells"].values() for clip in c["clips"]]
+    cells = handover(log, spec, {}, with_goals)
+    clips = [(cell, clip) for cell in cells.values() for clip in cell["clips"]]
     assert {cell["skill"] for cell, _ in clips} == {"two", "other", "rest"}
     for cell, clip in clips:
         for skill, goal in ((cell["skill"], "goal"), (cell["before"], "before_goal")):
@@ -138,10 +152,11 @@ def test_films_of_handovers_and_choices_name_goals(tmp_path: Path) -> None:
             assert re.fullmatch(form.get(skill, ""), clip[goal])
     logged = {shown_goal(goal.astype(np.float32)) for goal in log.goals["two"][log.skill == 0]}
     assert {clip["goal"] for cell, clip in clips if cell["skill"] == "two"} <= logged
-    none = handover_section(log, spec, {}, {}, filmed=True).data["handover"]["cells"]
-    assert {clip["goal"] for cell in none.values() for clip in cell["clips"]} == {""}
+    assert {
+        clip["goal"] for cell in handover(log, spec, {}, {}).values() for clip in cell["clips"]
+    } == {""}
 
-    played = play_episodes(run.policy, spec, 4, 0, 0, True, 2)
+    played = play(run, 4)[1]
     decisions = decision_data(played.log)
     goals = [goal for episode in played.log.episodes for goal in episode.calls["goal"]]
     assert decisions["calls"]["goal"] == goals
@@ -156,5 +171,4 @@ def test_films_of_handovers_and_choices_name_goals(tmp_path: Path) -> None:
 def test_a_report_without_goals_has_none(tmp_path: Path) -> None:
     rule = np.vectorize(lambda x: "rest")
     run = declared([Rest()], selector=lambda obs: rule(obs[:, 0])).train(quiet=True)
-    played = play_episodes(run.policy, run.declaration.spec, 2, 0, 0, True, 2)
-    assert played.section.context["goals"] == []
+    assert play(run, 2)[0].context["goals"] == []

@@ -15,8 +15,8 @@ from skillweave import EnvSpec, Run
 from skillweave.planning import CallLog
 from skillweave.reporting.report import film, handover
 from skillweave.reporting.report.film import HOLD
-from skillweave.reporting.report.handover import handover_section
-from skillweave.reporting.report.page import Section
+from skillweave.reporting.report.handover import add_handover
+from skillweave.reporting.report.page import Page
 from skillweave.runs.directory import CALLS
 
 pytest.importorskip("imageio_ffmpeg")
@@ -43,15 +43,15 @@ def log(run: Run) -> CallLog:
     return run.log_calls(400, num_envs=4)
 
 
-def section(log: CallLog, spec: Any = None, filmed: bool = True) -> Section:
-    spec = EnvSpec(Ragged) if spec is None else spec
-    return handover_section(log, spec, {"go": "#111111", "stay": "#222222"}, {}, filmed=filmed)
+def section(log: CallLog, filmed: bool = True) -> Page:
+    page = Page()
+    add_handover(page, log, EnvSpec(Ragged), {}, {}, filmed=filmed)
+    return page
 
 
 def test_the_matrix_and_the_ends(log: CallLog) -> None:
     words = section(log, filmed=False).context["handover"]
     matrix = log.handover()
-    assert words["columns"] == ["go", "stay"]
     assert [row["name"] for row in words["rows"]] == ["start of an episode", "go", "stay"]
     for i, row in enumerate(words["rows"]):
         for j, cell in enumerate(row["cells"]):
@@ -59,12 +59,12 @@ def test_the_matrix_and_the_ends(log: CallLog) -> None:
             if cell is not None:
                 assert cell["count"] == f"{matrix.done[i, j]} of {matrix.calls[i, j]}"
                 assert cell["share"] == pytest.approx(matrix.rate[i, j])
-    assert words["meaning"] == matrix.meaning
-    assert "without success() (stay)" in words["meaning"]
+    assert words["matrix"].skills == ("go", "stay")
+    assert "without success() (stay)" in words["matrix"].meaning
     go, stay = words["ends"]
     assert (go["name"], stay["name"]) == ("go", "stay")
     assert stay["ends"][1] == "100 %"
-    assert words["where"]["skills"] == ["go", "stay"]
+    assert words["called"] == ["go", "stay"]
 
 
 def test_calls_are_played_again_as_they_were(log: CallLog, monkeypatch: Any) -> None:
@@ -142,7 +142,7 @@ def test_a_log_of_images_has_no_chart(log: CallLog) -> None:
     space = gym.spaces.Box(-1, 1, (70,), np.float32)
     data = section(replace(log, observation_space=space, **flat), filmed=False)
     assert data.data["handover"]["names"] == []
-    assert data.context["handover"]["where"]["rows"] == []
+    assert data.context["handover"]["where"] == []
 
 
 @pytest.mark.slow
