@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from reporting.cart import RECIPE
-from reporting.walkway import CALLS, Moody, Walkway, declare, told
+from reporting.walkway import CALLS, Moody, Walkway, declare, played, told
 
 from skillweave import EnvSpec, SkillweaveError
 from skillweave.cli import main
@@ -23,8 +23,8 @@ from skillweave.reporting.report.facts import transition_rows, transitions
 from skillweave.reporting.report.film import HOLD, episode_shot, make_film
 from skillweave.reporting.report.groups import grouped, on_one_grid, over_seeds
 from skillweave.runs.directory import RunDirectory
-from skillweave.training.evaluation import episode_seeds, evaluate
-from skillweave.training.played_calls import Episode, PlayedCalls, PlayedEpisodes
+from skillweave.training.evaluation import episode_seeds
+from skillweave.training.played_calls import Episode
 
 
 def test_transitions_by_hand(tmp_path: Path) -> None:
@@ -39,16 +39,8 @@ def test_transitions_by_hand(tmp_path: Path) -> None:
     assert (stay["name"], stay["total"]) == ("stay", 2)
 
 
-def logged(tmp_path: Path, episodes: int = 2, env: Any = Walkway) -> PlayedEpisodes:
-    run = declare(env).train(tmp_path / "run", quiet=True)
-    spaces = run.policy.observation_space, run.policy.action_space
-    played = PlayedCalls(run.policy, spaces, own_rewards=True, inside=False)
-    evaluate(run.policy, run.declaration.spec, episodes=episodes, watch=played.add)
-    return PlayedEpisodes(played, episode_seeds(0, episodes))
-
-
 def test_calls_by_hand(tmp_path: Path) -> None:
-    log = logged(tmp_path)
+    log = played(tmp_path / "run", 2)
     assert (log.labels, log.judged) == (("go", "stay"), (True, False))
     for i, episode in enumerate(log.episodes):
         assert told(episode.calls) == CALLS
@@ -58,7 +50,7 @@ def test_calls_by_hand(tmp_path: Path) -> None:
 
 
 def test_many_calls_are_shown_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = logged(tmp_path, 3)
+    log = played(tmp_path / "run", 3)
     shown, missing = calls.episode_data(log, None)
     assert ([e["number"] for e in shown], missing) == ([1, 2, 3], [])
     assert told(shown[0]["calls"]) == CALLS
@@ -73,7 +65,7 @@ def test_many_calls_are_shown_in_part(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_decisions_are_coordinates_and_calls(tmp_path: Path) -> None:
-    found = calls.decision_data(logged(tmp_path, 1))
+    found = calls.decision_data(played(tmp_path / "run"))
     assert found["names"] == ["obs[0]", "obs[1]", "step of the episode"]
     assert found["rows"] == [[0, 0, 0], [2, 2, 2], [2, 5, 5], [4, 7, 7]]
     assert told(found["calls"]) == CALLS
@@ -101,7 +93,7 @@ def test_filmed_are_the_worst_the_median_and_the_best() -> None:
 
 def test_a_film_says_where_each_episode_begins(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
-    log = logged(tmp_path)
+    log = played(tmp_path / "run", 2)
     shots = {i: episode_shot(log.episodes[i]) for i in (1, 0)}
     film = make_film(EnvSpec(Walkway, engine="sync"), shots)
     # Nine steps, a frame for two, and the end, which stands for HOLD frames.
@@ -112,7 +104,7 @@ def test_a_film_says_where_each_episode_begins(tmp_path: Path) -> None:
 
 def test_an_environment_that_does_not_repeat_itself_is_told(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
-    log = logged(tmp_path, env=Moody)
+    log = played(tmp_path / "run", env=Moody)
     with pytest.raises(EnvError, match="does not repeat itself"):
         make_film(EnvSpec(Moody, engine="sync"), {0: episode_shot(log.episodes[0])})
 

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from reporting.walkway import CALLS, Go, Stay, Walkway, choose, declare, told
+from reporting.walkway import CALLS, Go, Stay, Walkway, choose, declare, played, told
 from small_runs import stage_entry
 
 from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
@@ -20,9 +20,8 @@ from skillweave.reporting.report.facts import about, number, percent
 from skillweave.reporting.report.single import score_words
 from skillweave.reporting.report.verdict import no_verdict, verdict
 from skillweave.runs.directory import RunDirectory
-from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
+from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation
-from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 from skillweave.training.skill_report import SkillReport
 from skillweave.types import Array
 
@@ -222,21 +221,12 @@ def test_docstrings_are_those_of_the_user() -> None:
 # Names of observations
 
 
-def log_of(tmp_path: Path, env: Any = Walkway) -> PlayedEpisodes:
-    run = declare(env).train(tmp_path / "run", quiet=True)
-    played = PlayedCalls(
-        run.policy, (run.policy.observation_space, run.policy.action_space), own_rewards=True
-    )
-    evaluate(run.policy, run.declaration.spec, episodes=1, watch=played.add)
-    return PlayedEpisodes(played, episode_seeds(0, 1))
-
-
 def test_named_observations_name_axes_and_what_each_call_saw(tmp_path: Path) -> None:
-    log, names = log_of(tmp_path), ["metre", "time"]
+    log, names = played(tmp_path / "run"), ["metre", "time"]
     assert calls.decision_data(log, names)["names"] == [*names, "step of the episode"]
     (shown,), _ = calls.episode_data(log, None, names)
     assert shown["seen"] == [[0, 0], [2, 2], [2, 5], [4, 7]]
-    assert calls.seen(log.episodes[0].calls, names)[0] == names
+    assert list(calls.seen(log.episodes[0].calls, names)) == names
     (shown,), _ = calls.episode_data(log, None)
     assert "seen" not in shown
     assert told(shown["calls"]) == CALLS

@@ -310,24 +310,12 @@ def test_render_policy(tmp_path: Path) -> None:
         assert abs(int(frames[i][10, 10, 0]) - 255 * at // 7) <= 16
 
 
-def test_the_policy_is_told_every_step(tmp_path: Path) -> None:
-    policy = Walker()
-    render_policy(EnvSpec(Corridor), policy, tmp_path / "a.gif", deterministic=False)
-    assert [int(s.elapsed[0]) for s in policy.told] == list(range(1, 8))
-    assert [float(s.obs[0, 0]) for s in policy.told] == list(range(7))
-    assert [float(s.next_obs[0, 0]) for s in policy.told] == list(range(1, 8))
-    assert [bool(s.terminated[0]) for s in policy.told] == [False] * 6 + [True]
-    last = policy.told[-1]
-    for array in (last.reward, last.action, last.truncated, last.timed_out, last.info["at"]):
-        assert array.shape == (1,)
-    assert last.reward.dtype == np.float32
+def test_max_steps_fps_every_and_actions_that_are_sampled(tmp_path: Path) -> None:
+    path, policy = tmp_path / "a.gif", Walker()
+    how: dict[str, Any] = {"max_steps": 4, "fps": 10, "every": 3, "deterministic": False}
+    result = render_policy(EnvSpec(Corridor), policy, path, **how)
     assert not any(deterministic for deterministic, _ in policy.asked)
     assert isinstance(policy.asked[0][1], np.random.Generator)
-
-
-def test_max_steps_fps_and_every(tmp_path: Path) -> None:
-    path = tmp_path / "a.gif"
-    result = render_policy(EnvSpec(Corridor), Walker(), path, max_steps=4, fps=10, every=3)
     assert result["episodes"] == [{"return": 4.0, "length": 4, "cut": True, "skills": {}}]
     assert decode(path)[1] == [300, 300, 1000]
     with pytest.raises(DeclarationError, match="at least 1"):
@@ -343,31 +331,25 @@ def test_wide_frames_are_reduced(tmp_path: Path) -> None:
     assert decode(tmp_path / "a.gif")[0][0].shape[1] == 667
 
 
-def test_an_environment_without_frames(tmp_path: Path) -> None:
-    class Blind(Corridor):
-        def render(self) -> Any:
-            return None
-
-    with pytest.raises(EnvError, match="render"):
-        render_policy(EnvSpec(Blind), Walker(), tmp_path / "a.gif")
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize(
-    ("kind", "shape"),
-    [("f4", (64, 64, 3)), ("u1", (64, 64)), ("u1", (64, 64, 4)), ("u1", (0, 0, 3))],
+    "picture",
+    [
+        None,
+        np.ones((64, 64, 3), np.float32),
+        *(np.ones(shape, np.uint8) for shape in [(64, 64), (64, 64, 4), (0, 0, 3)]),
+    ],
 )
-def test_a_picture_that_is_not_rgb_is_refused_before_a_step(
-    tmp_path: Path, kind: str, shape: tuple[int, ...]
-) -> None:
+def test_a_picture_that_is_not_rgb_is_refused_before_a_step(tmp_path: Path, picture: Any) -> None:
     class Odd(Corridor):
         step: Any = None
 
         def render(self) -> Any:
-            return np.ones(shape, kind)
+            return picture
 
-    with pytest.raises(EnvError, match=r"Odd cannot be filmed.*uint8"):
+    says = "NoneType" if picture is None else "uint8"
+    with pytest.raises(EnvError, match=rf"Odd cannot be filmed: render\(\) gave .*{says}"):
         render_policy(EnvSpec(Odd), Walker(), tmp_path / "a.gif")
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_environment_that_fails_to_draw_is_named(tmp_path: Path) -> None:
@@ -380,7 +362,6 @@ def test_an_environment_that_fails_to_draw_is_named(tmp_path: Path) -> None:
         render_policy(EnvSpec(NoScreen), Walker(), tmp_path / "a.gif")
     assert isinstance(caught.value.__cause__, RuntimeError)
     assert "MuJoCo" not in str(caught.value)
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_real_environment_without_a_display(

@@ -229,7 +229,7 @@ def _add_episodes(page: Page, played: Played, spec: EnvSpec, filmed: int, quiet:
         "inks": [charts.ink_on(color) for color in played.colors.values()],
         "episodes": shown,
         "judged": log.judged,
-        "seen": seen(log.episodes[0].calls[:1], named)[0],
+        "seen": list(seen(log.episodes[0].calls[:1], named)),
     }
     if film is not None:
         page.data["film"] = {"fps": film.fps, "every": film.every}
