@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -50,7 +49,7 @@ def chosen(obs: Any) -> Any:
     return np.array(["two", "number", "one", "other"])[kind], goals
 
 
-def test_each_kind_of_goals_has_its_picture(tmp_path: Path) -> None:
+def test_each_kind_of_goals_has_its_picture(tmp_path):
     two = gym.spaces.Box(0, 1, (2,), np.float32)
     one = gym.spaces.Box(0, np.inf, (1,), np.float32)
     skills = [
@@ -79,7 +78,7 @@ def test_each_kind_of_goals_has_its_picture(tmp_path: Path) -> None:
     assert max(row["x2"] for row in found["one"]["spec"]["data"]["values"]) <= 1.0
 
 
-def test_each_call_has_its_goal_in_words(tmp_path: Path) -> None:
+def test_each_call_has_its_goal_in_words(tmp_path):
     two, number = walks("two", SPACES["box"]), walks("number", SPACES["number"])
 
     def selector(obs: Any) -> Any:
@@ -98,7 +97,7 @@ def test_each_call_has_its_goal_in_words(tmp_path: Path) -> None:
     assert seen == {"two", "number", "rest"}
 
 
-def test_a_log_of_calls_has_pictures_of_its_own(tmp_path: Path) -> None:
+def test_a_log_of_calls_has_pictures_of_its_own(tmp_path):
     pytest.importorskip("vl_convert")
     inner = declared([walks("walk", SPACES["box"])], selector=passes_on)
     far = type("Far", (GoTo,), {"policy": inner, "max_steps": 8})()
@@ -122,7 +121,7 @@ def passes_on(obs: Any) -> Any:
     return ["walk"] * len(obs), obs["goal"]
 
 
-def test_the_map_of_goals_shows_their_whole_range(tmp_path: Path) -> None:
+def test_the_map_of_goals_shows_their_whole_range(tmp_path):
     def selector(obs: Any) -> Any:
         return ["two"] * len(obs), np.zeros((len(obs), 2))
 
@@ -131,7 +130,7 @@ def test_the_map_of_goals_shows_their_whole_range(tmp_path: Path) -> None:
     assert [encoding[axis]["scale"]["domain"] for axis in "xy"] == [[-1, 1], [-1, 1]]
 
 
-def test_films_of_handovers_and_choices_name_goals(tmp_path: Path) -> None:
+def test_films_of_handovers_and_choices_name_goals(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     skills = [walks("two", SPACES["box"]), walks("other", SPACES["dict"]), Rest()]
 
@@ -168,7 +167,7 @@ def test_films_of_handovers_and_choices_name_goals(tmp_path: Path) -> None:
     assert fields == [["what", "x", "y", "goal"], ["what", "x", "y"]]
 
 
-def test_a_report_without_goals_has_none(tmp_path: Path) -> None:
+def test_a_report_without_goals_has_none(tmp_path):
     rule = np.vectorize(lambda x: "rest")
     run = declared([Rest()], selector=lambda obs: rule(obs[:, 0])).train(quiet=True)
     assert play(run, 2)[0].context["goals"] == []
