@@ -88,7 +88,6 @@ def test_a_case_that_says_something_is_not(case):
 def test_a_skills_value_ends_at_the_limit_of_its_calls():
     usual, ended = (CASES[case](TASKS["bridge"], 1_000) for case in ("together", "limit ends"))
     limit = usual.skills[0].max_steps
-    assert limit is not None
     before, _ = River().reset(seed=0)
     for skill, same in zip(usual.skills, ended.skills, strict=True):
         assert same.name == skill.name
@@ -182,7 +181,6 @@ def step_of(before: np.ndarray, after: np.ndarray, reward: float) -> Step:
 def test_skill_rewards_are_the_tasks_and_the_weighted_sum_of_the_skills():
     learner = CASES["skill rewards x 0.1"](TASKS["bridge"], 100)
     assert isinstance(learner, Flat)
-    assert learner.learns is not None
     before, _ = River().reset(seed=0)
     after = before.copy()
     after[2] = 1  # the axe

@@ -156,9 +156,7 @@ def test_groups_of_one_seed_have_no_interval_to_draw():
 
 
 def test_curves_of_several_seeds_on_one_grid():
-    found = on_one_grid([[(0, 0.0), (100, 10.0)], [(50, 5.0), (150, 25.0)]])
-    assert found is not None
-    grid, values = found
+    grid, values = on_one_grid([[(0, 0.0), (100, 10.0)], [(50, 5.0), (150, 25.0)]])
     assert (grid[0], grid[-1]) == (50, 100)
     np.testing.assert_allclose(values[0], grid / 10)
     np.testing.assert_allclose(values[1], 5 + (grid - 50) / 5)
