@@ -15,7 +15,9 @@ import pytest
 
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, EnvError, MissingExtra, RunError
-from skillweave.reporting.video import PALETTE, VideoWriter, caption, color_of, render_policy
+from skillweave.reporting.palette import PALETTE, color_of
+from skillweave.reporting.video import caption, render_policy
+from skillweave.reporting.video_file import VideoWriter
 from skillweave.training.evaluation import evaluate
 from skillweave.types import Array, Memory, Step
 
@@ -84,6 +86,10 @@ def label(memory: Memory) -> tuple[str, tuple[int, int, int], str]:
     """The first three steps are one skill's, the rest another's."""
     second = int(memory["acted"][0]) > 3
     return ("walk", "run")[second], color_of(second), ""
+
+
+def render(env: Any, path: Path, policy: Any = None, **how: Any) -> dict[str, Any]:
+    return render_policy(EnvSpec(env), policy or Walker(), path, label, **how)
 
 
 def decode(path: Path) -> tuple[list[Array], list[int]]:
@@ -283,14 +289,14 @@ def test_a_missing_library_names_the_extra(tmp_path, monkeypatch, suffix, module
 
 
 def test_render_policy(tmp_path):
-    made, policy = [], Walker()
+    made = []
 
     def corridor(render_mode: str | None = None) -> Corridor:
         made.append(Corridor(render_mode))
         return made[0]
 
     path = tmp_path / "a.gif"
-    result = render_policy(EnvSpec(corridor), policy, path, episodes=2, seed=5, label=label)
+    result = render(corridor, path, episodes=2, seed=5)
     episode = {"return": 7.0, "length": 7, "cut": False, "skills": {"walk": 3, "run": 4}}
     assert result == {"path": str(path), "frames": 10, "episodes": [episode, episode]}
     assert made[0].seeds == [5, 6]
@@ -306,16 +312,16 @@ def test_render_policy(tmp_path):
         assert abs(int(frames[i][10, 10, 0]) - 255 * at // 7) <= 16
 
 
-def test_max_steps_fps_every_and_actions_that_are_sampled(tmp_path):
+def test_an_episode_is_cut_and_its_actions_are_sampled_where_that_is_asked(tmp_path):
     path, policy = tmp_path / "a.gif", Walker()
-    how: dict[str, Any] = {"max_steps": 4, "fps": 10, "every": 3, "deterministic": False}
-    result = render_policy(EnvSpec(Corridor), policy, path, **how)
+    result = render(Corridor, path, policy, max_steps=4, deterministic=False)
     assert not any(deterministic for deterministic, _ in policy.asked)
     assert isinstance(policy.asked[0][1], np.random.Generator)
-    assert result["episodes"] == [{"return": 4.0, "length": 4, "cut": True, "skills": {}}]
-    assert decode(path)[1] == [300, 300, 1000]
+    skills = {"walk": 3, "run": 1}
+    assert result["episodes"] == [{"return": 4.0, "length": 4, "cut": True, "skills": skills}]
+    assert decode(path)[1] == [100, 100, 1000]
     with pytest.raises(DeclarationError, match="at least 1"):
-        render_policy(EnvSpec(Corridor), Walker(), path, every=0)
+        render(Corridor, path, max_steps=0)
 
 
 def test_wide_frames_are_reduced(tmp_path):
@@ -323,7 +329,7 @@ def test_wide_frames_are_reduced(tmp_path):
         def render(self) -> Any:
             return np.zeros((500, 2000, 3), np.uint8)
 
-    render_policy(EnvSpec(Wide), Walker(), tmp_path / "a.gif", max_steps=1)
+    render(Wide, tmp_path / "a.gif", max_steps=1)
     assert decode(tmp_path / "a.gif")[0][0].shape[1] == 667
 
 
@@ -344,7 +350,7 @@ def test_a_picture_that_is_not_rgb_is_refused_before_a_step(tmp_path, picture):
 
     says = "NoneType" if picture is None else "uint8"
     with pytest.raises(EnvError, match=rf"Odd cannot be filmed: render\(\) gave .*{says}"):
-        render_policy(EnvSpec(Odd), Walker(), tmp_path / "a.gif")
+        render(Odd, tmp_path / "a.gif")
     assert not list(tmp_path.iterdir())
 
 
@@ -355,7 +361,7 @@ def test_an_environment_that_fails_to_draw_is_named(tmp_path):
 
     told = r"NoScreen cannot be filmed: its render.. raised RuntimeError: no light here \(test_vid"
     with pytest.raises(EnvError, match=told) as caught:
-        render_policy(EnvSpec(NoScreen), Walker(), tmp_path / "a.gif")
+        render(NoScreen, tmp_path / "a.gif")
     assert isinstance(caught.value.__cause__, RuntimeError)
     assert "MuJoCo" not in str(caught.value)
 
@@ -370,7 +376,7 @@ def test_a_real_environment_without_a_display(tmp_path, monkeypatch):
         def act(self, memory: Memory, obs: Array, mask: Any = None, **_: Any) -> Any:
             return np.zeros(1, np.int64), memory
 
-    result = render_policy(EnvSpec("CartPole-v1"), Left(), tmp_path / "a.gif", seed=1)
+    result = render("CartPole-v1", tmp_path / "a.gif", Left(), seed=1)
     if sys.platform == "linux":
         assert os.environ["SDL_VIDEODRIVER"] == "dummy"
     (episode,) = result["episodes"]
@@ -408,9 +414,9 @@ def test_a_film_shows_what_an_evaluation_plays(tmp_path):
             assert obs["at"].shape == (len(obs), 1)
             return obs["room"] % 2, memory
 
-    policies, spec = (Reader(), Reader()), EnvSpec(Rooms)
-    found = evaluate(policies[0], spec, episodes=1)
-    film = render_policy(spec, policies[1], tmp_path / "a.gif")
+    policies = Reader(), Reader()
+    found = evaluate(policies[0], EnvSpec(Rooms), episodes=1)
+    film = render(Rooms, tmp_path / "a.gif", policies[1])
     assert [e["return"] for e in film["episodes"]] == list(found.returns)
     told = [
         [
