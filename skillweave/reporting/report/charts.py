@@ -36,11 +36,11 @@ def number_axis(field: str, title: str, **rest: Any) -> dict[str, Any]:
     return {"field": field, "type": "quantitative", "title": title, "scale": scale} | rest
 
 
-def steps_axis(field: str = "x", title: str = STEPS) -> dict[str, Any]:
+def steps_axis() -> dict[str, Any]:
     """Return the encoding of steps: 200k, 1M."""
     label = "datum.value === 0 ? '0' : format(datum.value, '~s')"
     axis = {"labelExpr": label, "tickCount": 5, "labelOverlap": True}
-    return number_axis(field, title, axis=axis, scale={"zero": True, "nice": False})
+    return number_axis("x", STEPS, axis=axis, scale={"zero": True, "nice": False})
 
 
 def generation_axis() -> dict[str, Any]:

@@ -104,21 +104,26 @@ def name_of(run: RunDirectory) -> str:
 def facts(run: RunDirectory) -> list[tuple[str, str]]:
     """Return facts about the training, by name."""
     manifest = run.manifest
-    rows = [("Environment", manifest.env)]
-    if manifest.env_kwargs:
-        rows.append(("Made with", plain(manifest.env_kwargs)))
-    rows.append(("Recipe", manifest.recipe or "declared in Python"))
-    rows += [("Seed", str(manifest.seed)), ("Made", manifest.created.replace("T", " "))]
+    rows = [
+        ("Environment", manifest.env),
+        ("Made with", plain(manifest.env_kwargs) if manifest.env_kwargs else ""),
+        ("Recipe", manifest.recipe or "declared in Python"),
+        ("Seed", str(manifest.seed)),
+        ("Made", manifest.created.replace("T", " ")),
+    ]
     if (level := manifest.hierarchy) is not None:
-        rows.append(("Skills", ", ".join(manifest.by_path)))
-        rows.append(("A call lasts", _call_length(level)))
-        rows.append(("Selector", f"ready: {level.selector.kind}" if level.selector else "trained"))
-        rows.append(("Learning", level.learn))
-        if level.interrupt is not None:
-            rows.append(("Calls are cut at", f"{level.interrupt} deviations"))
-        if level.reflexes:
-            rows.append(("Reflexes", ", ".join(level.reflexes)))
-    return rows
+        rows += [
+            ("Skills", ", ".join(manifest.by_path)),
+            ("A call lasts", _call_length(level)),
+            ("Selector", f"ready: {level.selector.kind}" if level.selector else "trained"),
+            ("Learning", level.learn),
+            (
+                "Calls are cut at",
+                "" if level.interrupt is None else f"{level.interrupt} deviations",
+            ),
+            ("Reflexes", ", ".join(level.reflexes)),
+        ]
+    return [(name, fact) for name, fact in rows if fact]
 
 
 def _call_length(level: LevelEntry) -> str:

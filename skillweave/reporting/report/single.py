@@ -258,17 +258,15 @@ def _add_words(page: Page, run: RunDirectory, reached: Mapping[str, int]) -> Non
     page.context |= {
         "title": facts.name_of(run),
         "kind": "plain agent" if manifest.hierarchy is None else "hierarchy",
-        "env": manifest.env,
         "facts": facts.facts(run),
         "stages": facts.stage_rows(run, reached),
         "settings": [(k, facts.plain(v)) for k, v in facts.settings(manifest).items()],
-        "versions": manifest.versions.items(),
         "steps": sum(
             reached.get(entry.name, 0) if entry.steps is None else entry.steps
             for entry in manifest.stages
         ),
         "training_seconds": sum(entry.seconds or 0.0 for entry in manifest.stages),
-        "finished": run.finished,
+        "run": run,
     }
 
 
