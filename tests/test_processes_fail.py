@@ -55,6 +55,11 @@ def train(env, folder, workers=2, quiet=True, **how):
     return sw.train_agent(spec, SMALL, 128, folder, quiet=quiet, **how)
 
 
+def assert_same(run, other):
+    for name, value in other.policy.weights.items():
+        assert torch.equal(run.policy.weights[name], value)
+
+
 @pytest.mark.fast_cases(2)
 @pytest.mark.parametrize(
     ("what", "says"),
@@ -118,9 +123,7 @@ def test_an_environment_whose_close_raises_costs_no_weights(workers, how, tmp_pa
     said = capsys.readouterr().err
     assert said.count("Odd: close() raised") == 1
     assert type(how).__name__ in said
-    tidy = train(Ramp, tmp_path / "tidy", workers)
-    for name, value in tidy.policy.weights.items():
-        assert torch.equal(run.policy.weights[name], value)
+    assert_same(run, train(Ramp, tmp_path / "tidy", workers))
 
 
 def test_what_does_not_answer_is_named_with_what_it_was_asked(tmp_path, capsys, monkeypatch):
@@ -163,25 +166,20 @@ def test_a_daemon_trains_without_processes_and_finds_the_same(tmp_path, capfd):
         np.testing.assert_array_equal(value, found[name])
 
 
-@pytest.mark.parametrize("missing", ["memory without a name", "temporary files"])
+def no_memory(*_):
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize("missing", ["memory without a name", "temporary files", "room"])
 def test_without_shared_memory_the_weights_are_the_same(missing, tmp_path, monkeypatch):
-    before = train(Ramp, tmp_path / "with").policy.weights
-    monkeypatch.delattr(os, "memfd_create", raising=False)
+    before = train(Ramp, tmp_path / "with")
+    if missing == "room":
+        monkeypatch.setattr(os, "posix_fallocate", no_memory, raising=False)
+    else:
+        monkeypatch.delattr(os, "memfd_create", raising=False)
     if missing == "temporary files":
         monkeypatch.setattr(tempfile, "tempdir", "/proc/none")
-    after = train(Ramp, tmp_path / "without").policy.weights
-    assert all(torch.equal(before[k], after[k]) for k in before)
-
-
-def test_shared_memory_that_cannot_grow_does_not_end_a_process(tmp_path, monkeypatch):
-    before = train(Ramp, tmp_path / "with").policy.weights
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
-    after = train(Ramp, tmp_path / "without").policy.weights
-    assert all(torch.equal(before[k], after[k]) for k in before)
+    assert_same(train(Ramp, tmp_path / "without"), before)
 
 
 def test_an_environment_in_a_process_may_have_processes(tmp_path):

@@ -45,23 +45,27 @@ def run_program(folder: Path, text: str) -> str:
     return done.stderr
 
 
-def processes_in(folder: Path) -> int:
-    """How many processes have closed an environment."""
-    return len(list(folder.glob("pid-*")))
+def trained(folder: Path, text: str, processes: int) -> str:
+    """Run a program that trains in this many processes; what it says."""
+    said = run_program(folder, ENV + text)
+    assert "64 of 64 steps (100%)" in said
+    assert len(list(folder.glob("pid-*"))) == processes  # each closes an environment
+    return said
 
 
 def method(name: str) -> str:
     return f"multiprocessing.set_start_method({name!r})\n"
 
 
+GUARD = "if __name__ == '__main__':\n    "
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["spawn", "forkserver"])
 def test_a_plain_script_trains_in_one_process_where_others_would_run_it_again(name, tmp_path):
-    said = run_program(tmp_path, ENV + method(name) + TRAIN.format(env="Slow"))
-    assert "64 of 64 steps (100%)" in said
+    said = trained(tmp_path, method(name) + TRAIN.format(env="Slow"), 1)
     assert said.count("__name__ == '__main__'") == 1
     assert "EnvSpec(workers=2) uses processes" in said
-    assert processes_in(tmp_path) == 1
 
 
 @pytest.mark.slow
@@ -70,10 +74,7 @@ def test_a_plain_script_trains_in_one_process_where_others_would_run_it_again(na
 def test_a_guarded_script_trains_in_processes(name, where, tmp_path):
     train = TRAIN.format(env="Slow")
     body = {"in the guard": train, "in a function": "main()\n"}[where]
-    text = f"{ENV}\ndef main():\n    {train}\nif __name__ == '__main__':\n"
-    said = run_program(tmp_path, text + f"    {method(name)}    {body}")
-    assert "64 of 64 steps (100%)" in said
-    assert processes_in(tmp_path) == 3
+    trained(tmp_path, f"\ndef main():\n    {train}\n{GUARD}{method(name)}    {body}", 3)
 
 
 @pytest.mark.slow
@@ -84,19 +85,12 @@ def test_started_processes_need_no_shared_memory(name, tmp_path):
         "tempfile.TemporaryFile = full\n"
         "if hasattr(os, 'memfd_create'):\n    del os.memfd_create\n"
     )
-    guard = "if __name__ == '__main__':\n    "
-    said = run_program(
-        tmp_path, ENV + none + guard + method(name) + "    " + TRAIN.format(env="Slow")
-    )
-    assert "64 of 64 steps (100%)" in said
-    assert processes_in(tmp_path) == 3
+    trained(tmp_path, f"{none}{GUARD}{method(name)}    {TRAIN.format(env='Slow')}", 3)
 
 
 @pytest.mark.slow
 def test_a_plain_script_that_forks_trains_in_processes(tmp_path):
-    said = run_program(tmp_path, ENV + method("fork") + TRAIN.format(env="Slow"))
-    assert "64 of 64 steps (100%)" in said
-    assert processes_in(tmp_path) == 3
+    trained(tmp_path, method("fork") + TRAIN.format(env="Slow"), 3)
 
 
 @pytest.mark.slow
@@ -105,12 +99,8 @@ def test_what_cannot_be_sent_stays_in_one_process(tmp_path):
         "\nlock = __import__('threading').Lock()\n"
         "def made():\n    lock.locked()\n    return Slow()\n"
     )
-    guard = "if __name__ == '__main__':\n    "
-    text = ENV + odd + guard + method("spawn") + "    " + TRAIN.format(env="made")
-    said = run_program(tmp_path, text)
-    assert "64 of 64 steps (100%)" in said
+    said = trained(tmp_path, f"{odd}{GUARD}{method('spawn')}    {TRAIN.format(env='made')}", 1)
     assert said.count("cannot be sent to another process") == 1
-    assert processes_in(tmp_path) == 1
 
 
 @pytest.mark.slow
@@ -125,10 +115,9 @@ def test_asking_for_processes_in_a_plain_script_is_an_error_before_training(tmp_
 
 @pytest.mark.slow
 def test_a_run_begun_in_processes_goes_on_where_there_can_be_none(tmp_path):
-    guard = "if __name__ == '__main__':\n    "
     stop = "sw.train_agent(Slow, SMALL, 640, 'run', checkpoint_every=64, callback=stopped)\n"
     stopped = "\ndef stopped(now):\n    if now.steps > 300:\n        raise KeyboardInterrupt\n"
-    run_program(tmp_path, ENV + stopped + guard + method("fork") + "    " + stop)
+    run_program(tmp_path, f"{ENV}{stopped}{GUARD}{method('fork')}    {stop}")
     train = "sw.train_agent(Slow, SMALL, 640, 'run', resume=True)\n"
     said = run_program(tmp_path, ENV + method("spawn") + train)
     assert "640 of 640 steps (100%)" in said
@@ -209,10 +198,7 @@ def test_processes_work_where_the_program_has_threads(own, count, tmp_path, monk
 def test_a_thread_trains_in_processes_after_the_main_thread_has_ended(name, tmp_path):
     text = (
         "\nimport threading\n\ndef later():\n    threading.main_thread().join()\n    "
-        "sw.train_agent(Slow, SMALL, 64, 'run')\n\nif __name__ == '__main__':\n    "
+        f"sw.train_agent(Slow, SMALL, 64, 'run')\n\n{GUARD}{method(name)}    "
+        "threading.Thread(target=later).start()\n"
     )
-    said = run_program(
-        tmp_path, ENV + text + method(name) + "    threading.Thread(target=later).start()\n"
-    )
-    assert "64 of 64 steps (100%)" in said
-    assert processes_in(tmp_path) == 3
+    trained(tmp_path, text, 3)

@@ -39,7 +39,7 @@ def warm() -> gym.Env:
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def reference(tmp_path_factory):
     return Agent(warm, ON, STEPS).train(tmp_path_factory.mktemp("r") / "run", quiet=True).path
 
 
@@ -183,7 +183,7 @@ def environment(**more: str) -> dict[str, str]:
 
 
 @pytest.fixture
-def evil(tmp_path: Path) -> Path:
+def evil(tmp_path):
     """A run of somebody who wrote control characters wherever a text may be."""
     left = type("Stranger", (Left,), {"name": "left"})
     hierarchy = Hierarchy("CartPole-v1", [left()], algorithm=ON, selector=ON, steps=192)

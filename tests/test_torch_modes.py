@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -61,48 +62,35 @@ ALGORITHMS: dict[str, tuple[str, Any]] = {
 
 
 @contextlib.contextmanager
-def doubles() -> Iterator[None]:
-    torch.set_default_dtype(torch.float64)
+def mode(change: Callable[[Any], object], value: Any, usual: Any) -> Iterator[None]:
+    change(value)
     try:
         yield
     finally:
-        torch.set_default_dtype(torch.float32)
+        change(usual)
 
 
-@contextlib.contextmanager
-def elsewhere() -> Iterator[None]:
-    torch.set_default_device("meta")  # a device that holds no numbers: whatever lands there fails
-    try:
-        yield
-    finally:
-        torch.set_default_device(None)
+def doubles(dtype: torch.dtype = torch.float64) -> AbstractContextManager[None]:
+    return mode(torch.set_default_dtype, dtype, torch.float32)
 
 
-@contextlib.contextmanager
-def no_gradients() -> Iterator[None]:
-    torch.set_grad_enabled(False)
-    try:
-        yield
-    finally:
-        torch.set_grad_enabled(True)
+def no_gradients() -> AbstractContextManager[None]:
+    return mode(torch.set_grad_enabled, False, True)
 
 
 MODES = {
     "float64": doubles,
-    "float16": lambda: _default(torch.float16),
-    "another device": elsewhere,
+    "float16": lambda: doubles(torch.float16),
+    # A device that holds no numbers: whatever lands there fails.
+    "another device": lambda: mode(torch.set_default_device, "meta", None),
     "gradients off": no_gradients,
     "inference mode": torch.inference_mode,
 }
 
 
-@contextlib.contextmanager
-def _default(dtype: torch.dtype) -> Iterator[None]:
-    torch.set_default_dtype(dtype)
-    try:
-        yield
-    finally:
-        torch.set_default_dtype(torch.float32)
+def now() -> tuple[Any, ...]:
+    gradients = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+    return torch.get_default_dtype(), *gradients
 
 
 def used(folder: Path, name: str) -> tuple[Any, ...]:
@@ -129,20 +117,12 @@ def test_every_algorithm_learns_the_same(name, tmp_path):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_plain_training_is_the_same(mode, tmp_path):
+def test_plain_training_is_the_same_and_leaves_the_mode(mode, tmp_path):
     usual = used(tmp_path / "usual", "PPO")
     with MODES[mode]():
-        before = (
-            torch.get_default_dtype(),
-            torch.is_grad_enabled(),
-            torch.is_inference_mode_enabled(),
-        )
+        before = now()
         assert used(tmp_path / "here", "PPO") == usual
-        assert before == (
-            torch.get_default_dtype(),
-            torch.is_grad_enabled(),
-            torch.is_inference_mode_enabled(),
-        )
+        assert now() == before
 
 
 def tree(**more: Any) -> Hierarchy:
@@ -173,7 +153,6 @@ def test_an_environment_keeps_the_modes_of_the_user(workers, tmp_path):
 
     class Simulator(gym.Wrapper):
         def step(self, action):
-            assert torch.get_default_dtype() == torch.float64
             seen.add((torch.get_default_dtype(), torch.is_grad_enabled(), torch.ones(1).dtype))
             weight = torch.ones(1, requires_grad=True)
             (weight * 2).numpy()  # refused where gradients are on

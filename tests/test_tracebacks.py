@@ -36,7 +36,7 @@ def line_of(text: str) -> int:
     return next(i for i, line in enumerate(lines, 1) if line.endswith(text))
 
 
-def test_the_line_is_the_users_and_not_that_of_numpy_or_of_the_standard_library() -> None:
+def test_the_line_is_the_users_and_not_that_of_numpy_or_of_the_standard_library():
     def of_numpy() -> None:
         np.stack([])  # a function of NumPy fails
 
@@ -48,12 +48,12 @@ def test_the_line_is_the_users_and_not_that_of_numpy_or_of_the_standard_library(
     assert error_text(caught(of_json)).startswith("JSONDecodeError: Expecting")
 
 
-def test_without_a_frame_there_is_no_place() -> None:
+def test_without_a_frame_there_is_no_place():
     assert place(ValueError()) == ""
     assert error_text(ValueError("x")) == "ValueError: x"
 
 
-def test_code_that_was_sent_to_another_process_is_named_by_its_file_or_its_function() -> None:
+def test_code_that_was_sent_to_another_process_is_named_by_its_file_or_its_function():
     code = "def reward():\n    return 1 / 0\n"
     script: dict[str, Any] = {"__file__": "/somewhere/lander.py"}
     notebook: dict[str, Any] = {}
@@ -105,7 +105,7 @@ def in_ipython(folder: Path, **environment: str) -> str:
 
 
 @pytest.mark.slow
-def test_ipython_shows_the_users_lines_and_one_sentence(tmp_path: Path) -> None:
+def test_ipython_shows_the_users_lines_and_one_sentence(tmp_path):
     shown = in_ipython(tmp_path)
     assert "In[2], line 3" in shown
     assert 'agent.train("run", quiet=True)' in shown
@@ -124,7 +124,7 @@ def test_ipython_shows_the_users_lines_and_one_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ipython_shows_all_frames_where_the_switch_is_set(tmp_path: Path) -> None:
+def test_ipython_shows_all_frames_where_the_switch_is_set(tmp_path):
     shown = in_ipython(tmp_path, SKILLWEAVE_TRACEBACK="1")
     assert "skillweave/skills/outputs.py" in shown
     assert "IndexError" in shown
@@ -164,8 +164,8 @@ class Broken(gym.Env[Any, Any]):
     ],
 )
 def test_an_error_in_the_users_code_names_its_line_also_from_a_worker(
-    tmp_path: Path, workers: int, env: Any, skill: Any, who: str, line: str
-) -> None:
+    tmp_path, workers, env, skill, who, line
+):
     tiny = PPO(num_envs=2, n_steps=8, batch_size=16)
     spec = EnvSpec(env, workers=workers, engine="sync")
     hierarchy = Hierarchy(spec, [skill], algorithm=tiny, selector=tiny, steps=100)
@@ -174,7 +174,7 @@ def test_an_error_in_the_users_code_names_its_line_also_from_a_worker(
         hierarchy.train(tmp_path / "run", quiet=True)
 
 
-def test_an_error_in_a_ready_policy_names_its_line(tmp_path: Path) -> None:
+def test_an_error_in_a_ready_policy_names_its_line(tmp_path):
     class Ready(Skill):
         def policy(self, obs: Any) -> Any:
             return 1 / 0  # a policy fails
@@ -196,7 +196,7 @@ class Own(Memoryless):
         raise KeyError("left")  # act fails
 
 
-def test_an_error_in_a_policy_of_the_users_own_names_its_line(tmp_path: Path) -> None:
+def test_an_error_in_a_policy_of_the_users_own_names_its_line(tmp_path):
     class Ready(Skill):
         policy = Own()
 
@@ -209,7 +209,7 @@ def test_an_error_in_a_policy_of_the_users_own_names_its_line(tmp_path: Path) ->
         evaluate(Own(), "CartPole-v1", episodes=1)
 
 
-def test_an_error_of_the_librarys_own_is_not_blamed_on_the_user() -> None:
+def test_an_error_of_the_librarys_own_is_not_blamed_on_the_user():
     def ours() -> None:
         exec(compile("1 / 0", str(LIBRARY / "collecting" / "calls.py"), "exec"), {})
 

@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import as_path, short, shown_path
 from skillweave._internal.notices import notice
@@ -77,7 +75,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.runs.manifest import LevelEntry, manifest_in
 from skillweave.runs.trackers import track_film
-from skillweave.schema import AtLeastOne, Count, as_json, fitted
+from skillweave.schema import AtLeastOne, as_json, fitted
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
@@ -412,24 +410,22 @@ class TrainedPolicy:
         policy = self._policy(skill, goal, "render()")
         path = self._film_path(skill) if path is None else as_path(path, "path")
         must_be_own(path.parent)
-        seed = fitted(Count, seed, "seed")
         plain = isinstance(self.declaration, PlainAgent)
         roles = None if plain else roles_of(self.hierarchy)
         film = render_policy(
             self.declaration.spec,
             policy,
             path,
+            _labels_of(policy, roles, skill),
             episodes=episodes,
             seed=seed,
             deterministic=deterministic,
-            label=_labels_of(policy, roles, skill),
             max_steps=max_steps,
-            rng=np.random.default_rng(seed),
             quiet=quiet,
         )
         if path.parent.resolve() == self.path.resolve():
             track_film(RunDirectory.open(self.path), path)
-        return Film(film)
+        return film
 
     def _film_path(self, skill: str | None) -> Path:
         """Return the default path of a film."""

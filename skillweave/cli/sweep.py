@@ -295,9 +295,7 @@ def summary(results: Sequence[tuple[Job, float | str]], out: Path) -> Result:
         if returns:
             over = over_seeds(np.array(returns))
             group |= {"iqm": float(over.mean), "median": statistics.median(returns)}
-            group |= {"least": min(returns), "most": max(returns)}
-            if over.low is not None and over.high is not None:
-                group |= {"low": float(over.low), "high": float(over.high)}
+            group |= {"least": min(returns), "most": max(returns)} | over.bounds
         groups.append(group)
     result = {"out": str(out), "groups": groups, "runs": runs, "failed": failed}
     failures = [f"failed  {f['run']}: {f['error']}" for f in failed]

@@ -114,35 +114,36 @@ def plot_curves(
     for name, size in (("width", width), ("height", height)):
         fitted(_Inches | None, size, name)
     must_be_own(out.parent)
-    groups = _groups(runs)
-    groups = _renamed(groups, labels) if labels is not None else groups
+    groups = _groups(runs, labels)
     everyone = [run for group in groups.values() for run in group]
-    metric = _metric(everyone, metric, agent)
-    lines = tuple(_line(label, group, metric, agent, band) for label, group in groups.items())
+    curves = {run.path: _curves_of(run, agent) for run in everyone}
+    metric = _metric(everyone, curves, metric, agent)
+    lines = tuple(
+        _line(label, [curves[run.path][metric] for run in group], band)
+        for label, group in groups.items()
+    )
     binary = metric.endswith("success")
     if metric in AXES and agent is None:
         saved = [load_evaluation(run) for run in everyone]
         returns = [r for e in saved if e is not None for r in e.evaluation.returns]
         binary |= bool(returns) and is_binary(returns)
-    paths = _draw(lines, out, metric, agent, binary, width, height)
+    words = AXES.get(metric, metric.replace("_", " "))
+    words = words.replace("mean return", "episodes solved") if binary else words
+    words = words if agent is None else f"{agent}: {words}"
+    paths = _draw(lines, out, words, binary, width, height)
     return CurvesFigure(paths, lines, metric, _caption(lines, band))
 
 
-def _groups(runs: Paths | Mapping[str, Paths]) -> dict[str, list[RunDirectory]]:
+def _groups(
+    runs: Paths | Mapping[str, Paths], labels: Sequence[str] | None
+) -> dict[str, list[RunDirectory]]:
     """Return the runs of each line, by its name."""
     if isinstance(runs, Mapping):
-        return {str(label): open_runs(_paths(paths)) for label, paths in runs.items()}
-    return {group.name: group.runs for group in grouped(open_runs(_paths(runs)))}
-
-
-def _paths(paths: Paths) -> list[Path]:
-    listed = [paths] if isinstance(paths, str | Path) else list(paths)
-    return [as_path(path, "runs") for path in listed]
-
-
-def _renamed(
-    groups: dict[str, list[RunDirectory]], labels: Sequence[str]
-) -> dict[str, list[RunDirectory]]:
+        groups = {str(label): open_runs(_paths(paths)) for label, paths in runs.items()}
+    else:
+        groups = {group.name: group.runs for group in grouped(open_runs(_paths(runs)))}
+    if labels is None:
+        return groups
     names = [labels] if isinstance(labels, str) else list(labels)
     if len(names) != len(groups) or len(set(names)) < len(names):
         raise DeclarationError(
@@ -152,20 +153,30 @@ def _renamed(
     return dict(zip(names, groups.values(), strict=True))
 
 
-def _metric(runs: Sequence[RunDirectory], metric: str | None, agent: str | None) -> str:
+def _paths(paths: Paths) -> list[Path]:
+    listed = [paths] if isinstance(paths, str | Path) else list(paths)
+    return [as_path(path, "runs") for path in listed]
+
+
+def _metric(
+    runs: Sequence[RunDirectory],
+    curves: Mapping[Path, Mapping[str, Curve]],
+    metric: str | None,
+    agent: str | None,
+) -> str:
     """Return the metric that is drawn; every run has it."""
-    metrics_of_runs = [set(_curves_of(run, agent)) for run in runs]
-    common = set.intersection(*metrics_of_runs)
     if metric is None:
-        metric = next((m for m in ("eval_return", "return") if m in common), "return")
-    for run, metrics in zip(runs, metrics_of_runs, strict=True):
+        every = all("eval_return" in curves[run.path] for run in runs)
+        metric = "eval_return" if every else "return"
+    for run in runs:
+        metrics = curves[run.path]
+        whose = "the whole policy" if agent is None else repr(agent)
+        if not metrics:
+            agents = ", ".join(dict.fromkeys(c.agent for c in read_curves(run))) or "none yet"
+            raise DeclarationError(
+                f"{run.path} has no metrics of {whose}; there are metrics of: {agents}"
+            )
         if metric not in metrics:
-            whose = "the whole policy" if agent is None else repr(agent)
-            if not metrics:
-                agents = ", ".join(dict.fromkeys(c.agent for c in read_curves(run))) or "none yet"
-                raise DeclarationError(
-                    f"{run.path} has no metrics of {whose}; there are metrics of: {agents}"
-                )
             raise DeclarationError(
                 f"{run.path} has no metric {short(metric)} of {whose}"
                 f"{suggest(metric, sorted(metrics))}"
@@ -175,43 +186,35 @@ def _metric(runs: Sequence[RunDirectory], metric: str | None, agent: str | None)
 
 def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
     """Return curves by metric: of an agent, or of the whole policy over all steps of the run."""
-    all_curves = read_curves(run)
-    if agent is not None:
-        points_of_stage = {c.stage: c.points for c in all_curves if c.agent == agent}
-    else:
-        whole = {e.name for e in run.manifest.stages if e.kind in WHOLE}
-        points_of_stage = {
-            c.stage: c.points for c in all_curves if c.agent == c.stage and c.stage in whole
-        }
-    before = 0
-    parts = list[tuple[int, dict[str, Curve]]]()
-    for entry in run.manifest.stages:
-        if entry.name in points_of_stage:
-            parts.append((before, points_of_stage[entry.name]))
+    stages = run.manifest.stages
+    whole = [entry.name for entry in stages if entry.kind in WHOLE]
+    points_of_stage = {
+        c.stage: c.points
+        for c in read_curves(run)
+        if (c.agent == c.stage and c.stage in whole if agent is None else c.agent == agent)
+    }
+    before, joined = 0, dict[str, Curve]()
+    for entry in stages:
+        # Curves one after another, each moved by the steps before it.
+        for metric, points in points_of_stage.get(entry.name, {}).items():
+            joined.setdefault(metric, []).extend((before + x, y) for x, y in points)
         # An agent's steps are the steps of the stages in which it learns.
         if agent is None or entry.name in points_of_stage:
             before += entry.budget if entry.steps is None else entry.steps
-    names = dict.fromkeys(name for _, points in parts for name in points)
-    # Curves one after another, each moved by the steps before it.
-    return {
-        m: [(before + x, y) for before, points in parts for x, y in points.get(m, ())]
-        for m in names
-    }
+    return joined
 
 
-def _line(
-    label: str, runs: Sequence[RunDirectory], metric: str, agent: str | None, band: Band
-) -> Line:
-    curves = [_curves_of(run, agent)[metric] for run in runs]
+def _line(label: str, curves: Sequence[Curve], band: Band) -> Line:
+    """Return the line of several seeds, and the band around it."""
     gridded = on_one_grid(curves)
     if gridded is None:
         raise RunError(f"the runs of {label!r} have no steps in common: train them as long")
     steps, values = gridded
     low = high = None
-    if len(runs) > 1 and band != "none":
+    if len(curves) > 1 and band != "none":
         ends = (25, 75) if band == "iqr" else (0, 100)
         low, high = np.percentile(values, ends, axis=0)
-    return Line(label, len(runs), steps, np.median(values, axis=0), low, high)
+    return Line(label, len(curves), steps, np.median(values, axis=0), low, high)
 
 
 def _caption(lines: Sequence[Line], band: Band) -> str:
@@ -226,12 +229,12 @@ def _caption(lines: Sequence[Line], band: Band) -> str:
 def _draw(
     lines: Sequence[Line],
     out: Path,
-    metric: str,
-    agent: str | None,
+    words: str,
     binary: bool,
     width: float,
     height: float | None,
 ) -> tuple[Path, ...]:
+    """Draw the lines over ``words``, the title of their axis, and write the files."""
     with needs_extra("plotting", "plot"):
         import matplotlib
         from matplotlib.figure import Figure
@@ -245,22 +248,18 @@ def _draw(
         figure = Figure(figsize=(width, height), layout="constrained")
         axes = figure.add_subplot()
         for i, line in enumerate(lines):
-            look: dict[str, Any] = {"color": COLORS[i % len(COLORS)], "zorder": 3}
-            dashes = DASHES[i % len(DASHES)]
-            name = line.label
-            label = name if len(name) <= most else f"{name[: most - 1]}…"
-            axes.plot(line.steps, line.middle, linewidth=1.4, linestyle=dashes, label=label, **look)
+            color, dashes = COLORS[i % len(COLORS)], DASHES[i % len(DASHES)]
+            name = line.label if len(line.label) <= most else f"{line.label[: most - 1]}…"
+            look: dict[str, Any] = {"linewidth": 1.4, "linestyle": dashes, "zorder": 3}
+            axes.plot(line.steps, line.middle, color=color, label=name, **look)
             if line.low is not None and line.high is not None:
-                axes.fill_between(
-                    line.steps, line.low, line.high, alpha=0.2, linewidth=0, color=look["color"]
-                )
+                band = line.steps, line.low, line.high
+                axes.fill_between(*band, alpha=0.2, linewidth=0, color=color)
         axes.set_xlabel("environment steps")
-        words = AXES.get(metric, metric.replace("_", " "))
         if binary:
-            words = words.replace("mean return", "episodes solved")
             axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
             axes.set_ylim(-0.03, 1.03)
-        axes.set_ylabel(words if agent is None else f"{agent}: {words}")
+        axes.set_ylabel(words)
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.xaxis.set_major_formatter(FuncFormatter(_steps))
         axes.spines[["top", "right"]].set_visible(False)

@@ -31,6 +31,13 @@ class Lineage:
         members = self.born.values()
         return [k for k in self.winner.settings if len({str(b.settings[k]) for b in members}) > 1]
 
+    def scale(self, setting: str) -> str:
+        """Return how a setting is drawn: as "words", or on a "log" or a "linear" scale."""
+        values = [number_of(b, setting) for b in self.born.values()]
+        if any(isinstance(value, str) for value in values):
+            return "words"
+        return "log" if min(values) > 0 and max(values) > 5 * min(values) else "linear"
+
     def parent(self, born: LineageLine) -> LineageLine | None:
         """Return a member's parent; None in the first generation."""
         if born.parent is None or born.generation == 0:
@@ -75,8 +82,8 @@ def _sort(value: Any) -> str:
     return "number" if type(value) in (int, float) else type(value).__name__
 
 
-def number_of(born: LineageLine, setting: str) -> float:
-    """Return the value of a setting as it is drawn; of several widths their sum."""
+def number_of(born: LineageLine, setting: str) -> Any:
+    """Return the value of a setting as it is drawn: a word, or a number; of widths their sum."""
     value = born.settings[setting]
     number = sum(value) if isinstance(value, list) else value
     return 1.0 - number if setting in COMPLEMENT else number

@@ -129,22 +129,17 @@ def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[LineageLine], colo
 def _draw_setting(
     axes: Any, setting: str, lineage: Lineage, path: Sequence[LineageLine], color: str
 ) -> None:
-    everyone = list(lineage.born.values())
-    words: list[str] = []
-    if any(isinstance(b.settings.get(setting), str) for b in everyone):
-        words = sorted({b.settings[setting] for b in everyone})
-
-    def value(born: LineageLine) -> float:
-        return words.index(born.settings[setting]) if words else number_of(born, setting)
-
-    values = [value(b) for b in everyone]
-    for born in everyone:
-        axes.plot(born.generation, value(born), "o", color=FAINT, markersize=3, zorder=1)
-    line = [b.generation for b in path], [value(b) for b in path]
-    axes.plot(*line, color=color, linewidth=1.8, marker="o", markersize=4, zorder=2)
-    if words:
+    values = {id(b): number_of(b, setting) for b in lineage.born.values()}
+    scale = lineage.scale(setting)
+    if scale == "words":
+        words = sorted(set(values.values()))
+        values = {key: words.index(value) for key, value in values.items()}
         axes.set_yticks(range(len(words)), words)
-    elif min(values) > 0 and max(values) > 5 * min(values):
+    for born in lineage.born.values():
+        axes.plot(born.generation, values[id(born)], "o", color=FAINT, markersize=3, zorder=1)
+    line = [b.generation for b in path], [values[id(b)] for b in path]
+    axes.plot(*line, color=color, linewidth=1.8, marker="o", markersize=4, zorder=2)
+    if scale == "log":
         axes.set_yscale("log")
     _plain(axes, setting_title(setting))
     won = path[-1].settings[setting]

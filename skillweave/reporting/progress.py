@@ -9,6 +9,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -34,6 +35,21 @@ LOG = logging.getLogger("skillweave")
 LOG.addHandler(logging.NullHandler())
 
 
+@dataclass
+class _Stage:
+    """A stage, and its training so far."""
+
+    budget: int
+    steps: int = 0
+    seconds: float = 0.0
+    over: bool = False
+
+    @property
+    def passed(self) -> int:
+        """Steps of the budget that are over; a stage may end before it is spent."""
+        return self.budget if self.over else min(self.steps, self.budget)
+
+
 class Progress(Listener):
     """A display of each stage's steps, return (mean of the last 100 episodes), speed and time left.
 
@@ -48,12 +64,8 @@ class Progress(Listener):
     def __init__(self, *, quiet: bool = False) -> None:
         self._quiet = quiet
         self._display: Display | None = None
-        self._plan: dict[str, int] = {}
-        """Budgets of stages, in their order."""
+        self._stages: dict[str, _Stage] = {}
         self._several = False
-        self._spent: dict[str, tuple[int, float]] = {}
-        """Steps and seconds of each stage so far."""
-        self._over: set[str] = set()
         self._recent: deque[tuple[int, float]] = deque()  # (steps, seconds) of the latest ticks
         self._started = self._shown = 0.0
 
@@ -68,30 +80,29 @@ class Progress(Listener):
 
     def plan(self, stages: Iterable[StageEntry]) -> None:
         """Set all stages of the run, as its manifest lists them."""
-        for stage in stages:
-            self._plan[stage.name] = stage.budget
-            if stage.done:
-                self._spent[stage.name] = stage.steps or 0, stage.seconds or 0.0
-                self._over.add(stage.name)
-        self._several = len(self._plan) > 1
+        for entry in stages:
+            trained = entry.steps or 0, entry.seconds or 0.0
+            self._stages[entry.name] = _Stage(entry.budget, *trained, entry.done)
+        self._several = len(self._stages) > 1
 
     def stage(self, name: str, budget: int) -> None:
         """Start a stage, or continue it; ``budget`` in environment steps."""
-        self._plan[name] = budget
+        self._stages[name] = _Stage(budget)
         self._started = self._shown = time.monotonic()
         self._recent.clear()
         if self._display is None:
             self._line(f"{self._numbered(name)}: training for {budget:,} steps")
             return
         if self._several:
-            self._put_total(name)
+            self._put_total(self._display, name)
         self._display.put(Row(name, 0.0, f"0/{_short(budget)}"))
         self._display.draw()
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Report an update after ``steps`` and ``seconds`` of training."""
+        stage = self._stages[name]
+        stage.steps, stage.seconds = steps, seconds
         self._recent.append((steps, seconds))
-        self._spent[name] = steps, seconds
         while len(self._recent) > 2 and self._recent[1][1] < seconds - RECENT:
             self._recent.popleft()
         now = time.monotonic()
@@ -100,22 +111,20 @@ class Progress(Listener):
             pause = self._display.every
         if self._quiet or now - self._shown < pause:
             return
-        if self._display is None and steps >= self._plan[name]:
+        if self._display is None and steps >= stage.budget:
             return  # ``done`` reports it next
         self._shown = now
-        left = _clock(self._left(name))
-        self._show(name, steps, metrics, f"{self._speed():,.0f} steps/s", f"{left} left")
+        left = _clock(self._left(stage))
+        self._show(name, metrics, f"{self._speed():,.0f} steps/s", f"{left} left")
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """End a stage."""
-        if name not in self._plan:
+        if name not in self._stages:
             self.stage(name, steps)
-        self._spent[name] = steps, seconds
-        self._over.add(name)
-        if self._quiet:
-            return
-        speed = f"{steps / max(seconds, 1e-9):,.0f} steps/s"
-        self._show(name, steps, metrics, speed, f"done in {_clock(seconds)}")
+        self._stages[name] = _Stage(self._stages[name].budget, steps, seconds, over=True)
+        if not self._quiet:
+            speed = f"{steps / max(seconds, 1e-9):,.0f} steps/s"
+            self._show(name, metrics, speed, f"done in {_clock(seconds)}")
 
     def message(self, text: str) -> None:
         """Show a line of text, above the bars where there are any."""
@@ -126,56 +135,50 @@ class Progress(Listener):
         else:
             self._display.message(text)
 
-    def _show(
-        self, name: str, steps: int, metrics: dict[str, float], speed: str, left: str
-    ) -> None:
-        budget = self._plan[name]
-        share = min(steps / budget, 1.0)
+    def _show(self, name: str, metrics: dict[str, float], speed: str, left: str) -> None:
+        """Show a stage and what learns in it, as bars or as lines."""
+        stage, below = self._stages[name], _below(name, metrics)
+        share = min(stage.steps / stage.budget, 1.0)
         result = f"return {metrics['return']:.1f}" if "return" in metrics else ""
-        below = _below(name, metrics)
         if self._display is None:
-            part = f"{steps:,} of {budget:,} steps ({share:.0%})"
+            part = f"{stage.steps:,} of {stage.budget:,} steps ({share:.0%})"
             seconds = self._left_in_all(name)
             in_all = f"{_clock(seconds)} left in all" if seconds else ""
             numbers = (f"{row.name} {row.steps}" for row in below if row.name.startswith(INFO))
             text = ", ".join(filter(None, (part, result, *numbers, speed, left, in_all)))
             self._line(f"{self._numbered(name)}: {text}")
-            for row in below if name in self._over else ():
+            for row in below if stage.over else ():
                 if not row.name.startswith(INFO):
                     self._line(f"  {row.name}: " + ", ".join(filter(None, (row.steps, row.result))))
             return
-        counted = f"{_short(steps)}/{_short(budget)}"
-        self._display.put(Row(name, share, counted, result, speed, left))
-        for row in below:
+        counted = f"{_short(stage.steps)}/{_short(stage.budget)}"
+        for row in (Row(name, share, counted, result, speed, left), *below):
             self._display.put(row)
         if self._several:
-            self._put_total(name)
+            self._put_total(self._display, name)
         self._display.draw()
 
-    def _put_total(self, name: str) -> None:
+    def _put_total(self, display: Display, name: str) -> None:
         """Put the row of all stages."""
-        assert self._display is not None
-        budget = sum(self._plan.values())
-        passed = sum(self._plan[n] for n in self._over)
-        if name not in self._over:
-            passed += min(self._spent.get(name, (0, 0.0))[0], self._plan[name])
-        steps = sum(steps for steps, _ in self._spent.values())
+        stages = self._stages.values()
+        budget, steps = sum(s.budget for s in stages), sum(s.steps for s in stages)
+        share = sum(s.passed for s in stages) / budget
         left = self._left_in_all(name)
         if left is None:
             words = ""
         elif left == 0.0:
-            words = f"done in {_clock(sum(seconds for _, seconds in self._spent.values()))}"
+            words = f"done in {_clock(sum(s.seconds for s in stages))}"
         else:
             words = f"{_clock(left)} left"
-        at = f"stage {list(self._plan).index(name) + 1} of {len(self._plan)}"
         counted = f"{_short(steps)}/{_short(budget)}"
-        self._display.put(Row(IN_ALL, passed / budget, counted, at, "", words))
+        display.put(Row(IN_ALL, share, counted, f"stage {self._place(name)}", "", words))
+
+    def _place(self, name: str) -> str:
+        return f"{list(self._stages).index(name) + 1} of {len(self._stages)}"
 
     def _numbered(self, name: str) -> str:
         """Return a stage's name, and of several which one it is."""
-        if not self._several:
-            return name
-        return f"{name} ({list(self._plan).index(name) + 1} of {len(self._plan)})"
+        return f"{name} ({self._place(name)})" if self._several else name
 
     def _speed(self) -> float:
         """Return the recent steps per second."""
@@ -183,9 +186,9 @@ class Progress(Listener):
         then, since = self._recent[0] if len(self._recent) > 1 else (0, 0.0)
         return (steps - then) / max(seconds - since, 1e-9)
 
-    def _left(self, name: str) -> float:
+    def _left(self, stage: _Stage) -> float:
         """Return the seconds that a stage still takes at the recent speed."""
-        return max(self._plan[name] - self._recent[-1][0], 0) / max(self._speed(), 1e-9)
+        return max(stage.budget - stage.steps, 0) / max(self._speed(), 1e-9)
 
     def _left_in_all(self, name: str) -> float | None:
         """Return the seconds that all stages still take; None: unknown, or there is one stage.
@@ -194,10 +197,10 @@ class Progress(Listener):
         """
         if not self._several:
             return None
-        later = sum(b for n, b in self._plan.items() if n not in self._over and n != name)
-        steps = sum(steps for steps, _ in self._spent.values())
-        seconds = sum(seconds for _, seconds in self._spent.values())
-        now = 0.0 if name in self._over else self._left(name) if self._recent else None
+        here, stages = self._stages[name], self._stages.values()
+        later = sum(s.budget for s in stages if not s.over and s is not here)
+        steps, seconds = sum(s.steps for s in stages), sum(s.seconds for s in stages)
+        now = 0.0 if here.over else self._left(here) if self._recent else None
         if (later and not steps) or now is None:
             return None
         return now + (later * seconds / steps if later else 0.0)
@@ -259,20 +262,15 @@ class EpisodeProgress:
                 self._pause = PLAIN_PATIENCE
                 return
             self._pause = self._display.every
-        if self._display is not None:
-            self._draw(now)
+        episodes = f"{self._over:,} of {self._episodes:,} episodes"
+        played, taken = f"{self._steps:,} steps", now - self._started
+        if self._display is None:
+            say(f"{self._name}: {episodes}, {played}")
+            self._pause = max(PLAIN_PATIENCE, SPREAD * taken)
             return
-        text = f"{self._over:,} of {self._episodes:,} episodes, {self._steps:,} steps"
-        say(f"{self._name}: {text}")
-        self._pause = max(PLAIN_PATIENCE, SPREAD * (now - self._started))
-
-    def _draw(self, now: float) -> None:
-        assert self._display is not None
-        taken = now - self._started
         share = self._over / self._episodes
         left = f"{_clock(taken / share - taken)} left" if share else ""
-        counted = f"{self._over:,} of {self._episodes:,} episodes"
-        self._display.put(Row(self._name, share, counted, f"{self._steps:,} steps", left=left))
+        self._display.put(Row(self._name, share, episodes, played, left=left))
         self._display.draw()
 
 

@@ -20,7 +20,7 @@ from skillweave.envs.checks import LONG_EPISODE
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
-from skillweave.reporting.palette import BAND, BLACK, LINE, PALETTE, RGB, WHITE, color_of, is_light
+from skillweave.reporting.palette import BAND, BLACK, LINE, RGB, WHITE, is_light
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
@@ -28,18 +28,12 @@ from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.types import Array, Memory, Policy
 
-__all__ = ["PALETTE", "Film", "VideoWriter", "caption", "color_of", "render_policy"]
-
 MAX_WIDTH = 960  # pixels; larger frames are reduced
 MIN_WIDTH = 240  # pixels; smaller frames are enlarged
-
-
+EVERY = 2  # steps for each frame; each episode's end has a frame of its own
 HOLD = 1.0  # seconds for which the last frame of an episode stays
 LARGEST = 50_000_000
 """Bytes of a film that a notebook shows: it keeps a copy inside."""
-
-
-Label = Callable[[Memory], tuple[str, RGB, str]] | None
 
 
 @without_screen()
@@ -47,71 +41,64 @@ def render_policy(
     env_spec: EnvSpec,
     policy: Policy,
     path: str | Path,
+    label: Callable[[Memory], tuple[str, RGB, str]],
     *,
     episodes: int = 1,
     seed: int = 0,
     deterministic: bool = True,
     max_steps: int | None = None,
-    label: Label = None,
-    fps: float | None = None,
-    every: int = 2,
-    rng: np.random.Generator | None = None,
     quiet: bool = False,
-) -> dict[str, Any]:
-    """Run a policy on Gymnasium's environment and write a captioned video of it.
+) -> Film:
+    """Run a policy on Gymnasium's environment and write a captioned video of it, in real time.
 
     Args:
+        label: from the policy's memory after ``act`` to the acting skill's name, colour and goal.
         seed: episode i starts from ``reset(seed=seed + i)``.
         max_steps: of an episode; None: the environment's own limit, at most ``LONG_EPISODE``.
-        label: from the policy's memory after ``act`` to the acting skill's name and colour.
-        fps: steps shown per second; None: the environment's own, in real time.
-        every: steps for each frame; each episode's end has a frame of its own.
-        rng: for ``act``; None: derived from ``seed``.
         quiet: no progress.
 
     Returns:
-        ``path``, ``frames``, and ``episodes``: for each its ``return``, its ``length``, whether it
-        was ``cut`` before its end and, as ``skills``, how many steps each acted.
+        The film, with facts about each episode: its ``return``, its ``length``, whether it was
+        ``cut`` before its end and, as ``skills``, how many steps each acted.
 
     Raises:
         EnvError: the environment gives no frames; see VideoWriter for more.
         MissingExtra: the extra 'video' is not installed.
     """
     episodes = fitted(AtLeastOne, episodes, "episodes")
-    every = fitted(AtLeastOne, every, "every")
     seed = fitted(Count, seed, "seed")
     max_steps = LONG_EPISODE if max_steps is None else fitted(AtLeastOne, max_steps, "max_steps")
-    rng = rng or (Seeds(seed) / "render").numpy()
+    how: Any = {"deterministic": deterministic, "rng": np.random.default_rng(seed)}
     with global_generators(Seeds(seed) / "render" / "global"):
         env = env_spec.make(render_mode="rgb_array")
         # Observations, infos and masks are as in an evaluation.
         engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
         try:
-            rate = (fps or env.metadata.get("render_fps") or 30) / every
             with (
-                VideoWriter(path, rate) as video,
+                VideoWriter(path, (env.metadata.get("render_fps") or 30) / EVERY) as video,
                 EpisodeProgress(episodes, quiet=quiet, name="film") as progress,
             ):
-                film = _Film(env, video, every, label)
+                record = _Record(env, video, label)
                 whole = SeededEpisodes(engine, range(seed, seed + episodes), max_steps)
-                how: Any = {"deterministic": deterministic, "rng": rng}
-                for played in play(policy, whole, before_step=film.before_step, **how):
-                    film.after_step(played)
+                for played in play(policy, whole, before_step=record.before_step, **how):
+                    record.after_step(played)
                     progress.watch(played)
         finally:
             engine.close()
-    return {"path": str(path), "frames": video.frames, "episodes": film.episodes}
+    return Film(path=str(path), frames=video.frames, episodes=record.episodes)
 
 
-class _Film:
+class _Record:
     """Frames of episodes as they are played, and the facts about each."""
 
     def __init__(
-        self, env: gym.Env[Any, Any], video: VideoWriter, every: int, label: Label
+        self,
+        env: gym.Env[Any, Any],
+        video: VideoWriter,
+        label: Callable[[Memory], tuple[str, RGB, str]],
     ) -> None:
         self.env = env
         self.video = video
-        self.every = every
         self.label = label
         self.episodes: list[dict[str, Any]] = []
         self._begin()
@@ -119,16 +106,14 @@ class _Film:
     def _begin(self) -> None:
         self._elapsed = 0
         self._total = 0.0
-        self._skill = self._goal = ""
-        self._color = BLACK
         self._skills = Counter[str]()
 
     def before_step(self, memory: Memory) -> None:
         """Show what the policy is about to do."""
-        if self.label is not None:
-            self._skill, self._color, self._goal = self.label(memory)
-            self._skills[self._skill] += 1
-        if self._elapsed % self.every == 0:
+        skill, self._color, goal = self.label(memory)
+        self._acting = f"{skill} {goal}" if goal else skill
+        self._skills[skill] += 1
+        if self._elapsed % EVERY == 0:
             self._show("return")
 
     def after_step(self, played: Played) -> None:
@@ -149,8 +134,7 @@ class _Film:
 
     def _show(self, word: str, seconds: float | None = None) -> None:
         text = f"step {self._elapsed}   {word} {self._total:+.1f}"
-        skill = f"{self._skill} {self._goal}" if self._goal else self._skill
-        self.video.add(caption(frame_of(self.env), skill, self._color, text), seconds)
+        self.video.add(caption(frame_of(self.env), self._acting, self._color, text), seconds)
 
 
 def frame_of(env: gym.Env[Any, Any]) -> Array:
@@ -212,9 +196,7 @@ def enlarged(frame: Array) -> Array:
 # Captions
 
 
-def caption(
-    frame: Array, text_left: str, color: RGB, text_right: str, size: int | None = None
-) -> Array:
+def caption(frame: Array, text_left: str, color: RGB, text_right: str) -> Array:
     """Return the frame above a dark band: the acting skill on its left, text on its right.
 
     Nothing of the frame is covered. A frame narrower than ``MIN_WIDTH`` is enlarged k times. A
@@ -222,14 +204,13 @@ def caption(
 
     Args:
         frame: (H, W, 3) uint8.
-        size: of the font, in pixels; None: in proportion to the frame.
 
     Returns:
         (H·k + band, W·k, 3) uint8, of even height.
     """
     frame = enlarged(frame)
     height, width = frame.shape[:2]
-    size = size or min(max(round(min(height / 22, width / 28)), 12), 40)
+    size = min(max(round(min(height / 22, width / 28)), 12), 40)  # of the font
     band = round(1.8 * size)
     margin = size // 2
     band += (height + band) % 2

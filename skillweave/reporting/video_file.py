@@ -6,8 +6,6 @@ import importlib
 import os
 import struct
 import subprocess
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from subprocess import PIPE
 from typing import Any, Self
@@ -38,17 +36,16 @@ class VideoWriter:
     def __init__(self, path: str | Path, fps: float, most_bits: int | None = None) -> None:
         self.path = Path(path)
         self.frames = 0
-        kinds: dict[str, Callable[[Path, float], _Gif | _Mp4]]
-        kinds = {".gif": _Gif, ".mp4": partial(_Mp4, most_bits=most_bits)}
-        kind = kinds.get(self.path.suffix.lower())
-        if kind is None:
+        suffix = self.path.suffix.lower()
+        if suffix not in (".gif", ".mp4"):
             raise DeclarationError(f"cannot write a video to {path}: it must end in .gif or .mp4")
         self.path.parent.mkdir(parents=True, exist_ok=True)
         # In the same folder, since renaming works only within a file system, and with the suffix
         # last, since ffmpeg goes by it.
         self._part = self.path.with_name(f".{self.path.stem}.{os.getpid()}{self.path.suffix}")
         self._shape: tuple[int, ...] | None = None
-        self._sink = kind(self._part, fps)
+        gif = suffix == ".gif"
+        self._sink = _Gif(self._part, fps) if gif else _Mp4(self._part, fps, most_bits)
 
     def add(self, frame: Array, seconds: float | None = None) -> None:
         """Append a frame (H, W, 3) uint8 that stays for ``seconds``, by default 1 / fps."""
@@ -77,7 +74,7 @@ class VideoWriter:
 class _Mp4:
     """H.264 as every browser plays it, through a pipe to ffmpeg."""
 
-    def __init__(self, path: Path, fps: float, most_bits: int | None = None) -> None:
+    def __init__(self, path: Path, fps: float, most_bits: int | None) -> None:
         self._ffmpeg = extra("imageio_ffmpeg").get_ffmpeg_exe()
         self._path = path
         self._fps = fps

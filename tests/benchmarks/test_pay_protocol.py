@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -81,21 +82,8 @@ def declare(task, **how):
     return Hierarchy(task.env, [Right(), Left()], **plainly(options))
 
 
-def further(task, skills):
-    found = declare(task, selector_steps=192)
-    for skill in found.skills:
-        skill.policy = skills[skill.name]
-    return found
-
-
-def long_calls(task, skills):
-    found = further(task, skills)
-    found.call_steps = 4
-    return found
-
-
-def to_the_right(task, skills):
-    found = declare(task, selector=lambda obs: np.zeros(len(obs), np.int64))
+def ready(task, skills, **how):
+    found = declare(task, **how)
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found
@@ -107,13 +95,13 @@ def suite():
         tasks=[Task("right", spec(3), 0.5), Task("left", spec(-3), 0.5)],
         unit=1.0,
         source=lambda task: declare(task, skill_steps=128, selector_steps=256),
-        further=further,
+        further=partial(ready, selector_steps=192),
         skills=lambda: [Right(), Left()],
         flat=TINY,
         weights=({"right": 1.0, "left": 1.0}, {"right": 1.0, "left": 0.0}),
         cells=lambda obs: obs.astype(int),
-        variants={"long-calls": long_calls},
-        fixed={"always-right": to_the_right},
+        variants={"long-calls": partial(ready, selector_steps=192, call_steps=4)},
+        fixed={"always-right": partial(ready, selector=lambda obs: np.zeros(len(obs), np.int64))},
         episodes=4,
     )
 
@@ -308,11 +296,11 @@ def test_skills_that_go_on_begin_with_what_they_were_and_f4_acts_with_those(tmp_
         return declare(task, learn="together", together_steps=192)
 
     goes_on = replace(suite(), tasks=tasks, further=again, variants={}, fixed={})
-    ready, bench = [], Bench(goes_on, Results(tmp_path), seed=0)
+    acting, bench = [], Bench(goes_on, Results(tmp_path), seed=0)
     by_lot = agents.by_lot
 
     def noted(hierarchy, seed):
-        ready.append([s.policy for s in hierarchy.skills])
+        acting.append([s.policy for s in hierarchy.skills])
         return by_lot(hierarchy, seed)
 
     monkeypatch.setattr(agents, "by_lot", noted)
@@ -323,8 +311,8 @@ def test_skills_that_go_on_begin_with_what_they_were_and_f4_acts_with_those(tmp_
     begun = {name: told["sha256"] for name, told in stage["starts"].items()}
     assert begun == {name: learnt[name]["sha256"] for name in ("right", "left", "selector")}
     skills = bench._skills()
-    assert len(ready) == 2  # for chance, and for the best single skill
-    for right, left in ready:
+    assert len(acting) == 2  # for chance, and for the best single skill
+    for right, left in acting:
         for policy, name in ((right, "right"), (left, "left")):
             for k, value in policy.weights.items():
                 np.testing.assert_array_equal(value, skills[name].weights[k])

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from living import alive, all_end
 
 ROOT = Path(__file__).parents[2]
 STUB = """
@@ -34,16 +35,8 @@ if __name__ == "__main__":
 """
 
 
-def is_running(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text()
-    except FileNotFoundError:
-        return False
-    return state.rpartition(")")[2].split()[0] != "Z"  # a zombie has ended
-
-
-def until(condition, seconds: float = 60.0) -> bool:
-    end = time.monotonic() + seconds
+def until(condition):
+    end = time.monotonic() + 60.0
     while time.monotonic() < end:
         if condition():
             return True
@@ -63,12 +56,12 @@ def test_a_benchmark_that_is_sent_sigterm_leaves_no_process(tmp_path, how):
         try:
             assert until(told.exists)
             pid = int(told.read_text())
-            assert is_running(pid)
+            assert alive(pid)
             stub.terminate()
             assert until(lambda: stub.poll() is not None)
         finally:
             stub.kill()
-    assert until(lambda: not is_running(pid), 20.0)
+    assert all_end([pid], 20.0)
     assert stub.returncode in (-signal.SIGTERM, 128 + signal.SIGTERM)
 
 

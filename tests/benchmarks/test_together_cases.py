@@ -3,7 +3,6 @@
 import importlib.util
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,16 +25,15 @@ OF_ALL_ALIKE = ("no imitation", "limit ends", "one advantage scale")
     [("bridge", case) for case in CASES]
     + [("lander", case) for case in CASES if case not in OF_ALL_ALIKE],
 )
-def test_every_case_has_the_steps_that_are_asked(task: str, case: str) -> None:
+def test_every_case_has_the_steps_that_are_asked(task, case):
     learner = CASES[case](TASKS[task], 10_000)
     steps = learner.total_steps if isinstance(learner, Hierarchy) else learner.steps
     assert 9_980 <= steps <= 10_000
 
 
 @pytest.mark.parametrize("task", ["8x8", "16x16", "bridge"])
-def test_with_one_scale_nobody_divides_advantages_by_their_own_deviation(task: str) -> None:
+def test_with_one_scale_nobody_divides_advantages_by_their_own_deviation(task):
     found = CASES["one advantage scale"](TASKS[task], 10_000)
-    assert isinstance(found, Hierarchy)
     learning = [found.algorithm, found.selector, *(s.algorithm for s in found.skills)]
     assert not any(each.normalize_advantage for each in learning if isinstance(each, PPO))
     usual = CASES["together"](TASKS[task], 10_000)
@@ -57,13 +55,9 @@ EVERY = (*CHAINS, "lander")
         ("then, no anchor", CHAINS, "then", {"reference_kl": None}),
     ],
 )
-def test_a_case_changes_what_it_names_and_nothing_else(
-    case: str, tasks: tuple[str, ...], usual: str, changed: dict[str, Any]
-) -> None:
+def test_a_case_changes_what_it_names_and_nothing_else(case, tasks, usual, changed):
     for task in tasks:
         before, after = (CASES[name](TASKS[task], 1_000) for name in (usual, case))
-        assert isinstance(before, Hierarchy)
-        assert isinstance(after, Hierarchy)
         assert before.together != after.together
         before.together = replace(before.together, **changed)
         assert manifest(after, seed=0, flat=False) == manifest(before, seed=0, flat=False)
@@ -81,22 +75,19 @@ def test_a_case_changes_what_it_names_and_nothing_else(
         ("lander", "one advantage scale", "the task's advantage keeps one of its own"),
     ],
 )
-def test_a_case_that_says_nothing_on_a_task_is_refused(task: str, case: str, says: str) -> None:
+def test_a_case_that_says_nothing_on_a_task_is_refused(task, case, says):
     with pytest.raises(SkillweaveError, match=says):
         check_case(case, task)
 
 
 @pytest.mark.parametrize("case", ["together", "limit ends", "then, no anchor", "flat", "bonus"])
-def test_a_case_that_says_something_is_not(case: str) -> None:
+def test_a_case_that_says_something_is_not(case):
     check_case(case, "bridge")
 
 
-def test_a_skills_value_ends_at_the_limit_of_its_calls() -> None:
+def test_a_skills_value_ends_at_the_limit_of_its_calls():
     usual, ended = (CASES[case](TASKS["bridge"], 1_000) for case in ("together", "limit ends"))
-    assert isinstance(usual, Hierarchy)
-    assert isinstance(ended, Hierarchy)
     limit = usual.skills[0].max_steps
-    assert limit is not None
     before, _ = River().reset(seed=0)
     for skill, same in zip(usual.skills, ended.skills, strict=True):
         assert same.name == skill.name
@@ -110,15 +101,13 @@ def test_a_skills_value_ends_at_the_limit_of_its_calls() -> None:
 
 def passes(found: Hierarchy | Flat) -> list[tuple[int, int]]:
     """Over each rollout, and rows of a minibatch, of all skills and of ``landing``."""
-    assert isinstance(found, Hierarchy)
     who = found.algorithm, found.skill("landing").algorithm
     return [(a.update_epochs, a.batch_size) for a in who if isinstance(a, PPO)]
 
 
-def test_the_lander_is_what_the_measured_table_says() -> None:
+def test_the_lander_is_what_the_measured_table_says():
     steps = 1_620_000
     found = CASES["together"](TASKS["lander"], steps)
-    assert isinstance(found, Hierarchy)
     assert passes(found) == [(3, 1024), (3, 1024)]
     assert passes(CASES["apart"](TASKS["lander"], steps)) == [(6, 512), (4, 1024)]
     assert [s.steps or found.apart.skill_steps for s in found.skills] == [10_000, 10_000, 50_000]
@@ -127,13 +116,10 @@ def test_the_lander_is_what_the_measured_table_says() -> None:
     same = replace(recipes.load("lunar-lander"), env=found.env)  # but for how many workers step it
     assert manifest(same, seed=0, flat=False) == manifest(found, seed=0, flat=False)
     then = CASES["then"](TASKS["lander"], steps)
-    assert isinstance(then, Hierarchy)
     assert then.selector == found.selector, "budgets alone differ"
 
 
-def test_other_recipes_have_no_settings_to_learn_apart(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_other_recipes_have_no_settings_to_learn_apart(monkeypatch, capsys):
     asked = ["hierarchy", "--apart", "--recipe", "shuttle"]
     monkeypatch.setattr("sys.argv", asked)
     with pytest.raises(SystemExit):
@@ -141,15 +127,11 @@ def test_other_recipes_have_no_settings_to_learn_apart(
     assert "those of the recipe lunar-lander" in capsys.readouterr().err
 
 
-def test_who_learns_is_the_same_but_for_what_a_case_names() -> None:
+def test_who_learns_is_the_same_but_for_what_a_case_names():
     usual, plain, skills, errors = (
         CASES[case](TASKS["unlock-pickup"], 1_000)
         for case in ("together", "no imitation", "selector does not imitate", "no least deviation")
     )
-    assert isinstance(usual, Hierarchy)
-    assert isinstance(plain, Hierarchy)
-    assert isinstance(skills, Hierarchy)
-    assert isinstance(errors, Hierarchy)
     assert type(usual.algorithm) is type(usual.selector) is SelfImitationPPO
     assert type(plain.algorithm) is type(plain.selector) is PPO
     for own, without in (
@@ -163,7 +145,7 @@ def test_who_learns_is_the_same_but_for_what_a_case_names() -> None:
     assert errors.selector == replace(usual.selector, min_advantage_std=0.0)
 
 
-def test_calls_cost_something_where_successes_come_early_or_skills_learn_apart() -> None:
+def test_calls_cost_something_where_successes_come_early_or_skills_learn_apart():
     costs = {
         (task, case): CASES[case](TASKS[task], 1_000).selection.call_cost  # type: ignore[union-attr]
         for task in ("8x8", "16x16")
@@ -172,7 +154,6 @@ def test_calls_cost_something_where_successes_come_early_or_skills_learn_apart()
     assert [key for key, cost in costs.items() if not cost] == [("16x16", "together")]
     for case in ("apart", "then"):
         learner = CASES[case](TASKS["16x16"], 1_000)
-        assert isinstance(learner, Hierarchy)
         assert type(learner.algorithm) is type(learner.selector) is PPO
 
 
@@ -184,7 +165,7 @@ def test_calls_cost_something_where_successes_come_early_or_skills_learn_apart()
         ("unlock-pickup", "UnlockPickup"),
     ],
 )
-def test_a_room_is_scored_in_itself(task: str, room: str) -> None:
+def test_a_room_is_scored_in_itself(task, room):
     for case in ("together", "apart", "flat", "bonus"):
         spec = CASES[case](TASKS[task], 10_000).spec
         assert spec.kwargs.get("room", ROOM) == room
@@ -197,10 +178,9 @@ def step_of(before: np.ndarray, after: np.ndarray, reward: float) -> Step:
     return Step(before[None], one, after[None], np.array([reward]), no, no, no, one, {})
 
 
-def test_skill_rewards_are_the_tasks_and_the_weighted_sum_of_the_skills() -> None:
+def test_skill_rewards_are_the_tasks_and_the_weighted_sum_of_the_skills():
     learner = CASES["skill rewards x 0.1"](TASKS["bridge"], 100)
     assert isinstance(learner, Flat)
-    assert learner.learns is not None
     before, _ = River().reset(seed=0)
     after = before.copy()
     after[2] = 1  # the axe
@@ -211,7 +191,7 @@ def test_skill_rewards_are_the_tasks_and_the_weighted_sum_of_the_skills() -> Non
 
 
 @pytest.mark.parametrize("case", ["flat", "bonus", "skill rewards x 1.0"])
-def test_flat_agents_are_scored_by_the_task(case: str) -> None:
+def test_flat_agents_are_scored_by_the_task(case):
     found = one(case, "bridge", 2_000, "auto", f4=True, seed=0)
     assert found["score"] <= 0.05
     assert found["usage"] == {}
@@ -230,7 +210,7 @@ def walker(goal: Callable[[np.ndarray], np.ndarray]) -> Callable[[np.ndarray], n
     return act
 
 
-def test_skills_are_scored_without_their_selector(tmp_path: Path) -> None:
+def test_skills_are_scored_without_their_selector(tmp_path):
     def at_river(obs: np.ndarray) -> np.ndarray:
         return np.stack([np.full(len(obs), RIVER - 1.0), obs[:, 1]], axis=1)
 
@@ -256,16 +236,14 @@ def test_skills_are_scored_without_their_selector(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_hierarchys_skills_are_scored_when_asked() -> None:
+def test_a_hierarchys_skills_are_scored_when_asked():
     found = one("together", "bridge", 4_000, "auto", f4=True, seed=0)
     assert list(found["f4"]) == ["at random", "get_axe", "chop", "build", "cross"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["bridge", "lander"])
-def test_skills_alone_are_scored_as_the_run_plays_them(
-    task: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_skills_alone_are_scored_as_the_run_plays_them(task, monkeypatch):
     asked = []
 
     def score(task: Task, run: Any, greedy: bool | None = None, **how: Any) -> tuple[float, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 
 import pytest
 from small_runs import level_entry, small_manifest
@@ -24,7 +23,7 @@ STAGE = StageEntry(
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> RunDirectory:
+def run(tmp_path):
     skill = SkillEntry("land", 10)
     hop = SkillEntry("hop", 5, policy=Source("onnx", file="hop.onnx"))
     manifest = small_manifest(
@@ -51,7 +50,7 @@ def evaluate(run: RunDirectory) -> None:
     save_evaluation(run, found, 5, True)
 
 
-def test_the_header_is_what_the_hub_reads(run: RunDirectory) -> None:
+def test_the_header_is_what_the_hub_reads(run):
     yaml = pytest.importorskip("yaml")
     evaluate(run)
     _, header, _ = card(run).split("---\n", 2)
@@ -65,7 +64,7 @@ def test_the_header_is_what_the_hub_reads(run: RunDirectory) -> None:
     assert (metric["type"], metric["value"]) == ("mean_reward", "2.00 +/- 1.41")
 
 
-def test_it_says_what_each_skill_was_measured_to_do(run: RunDirectory) -> None:
+def test_it_says_what_each_skill_was_measured_to_do(run):
     assert "It was not evaluated." in card(run)
     assert "model-index" not in card(run)
     evaluate(run)
@@ -79,7 +78,7 @@ def test_it_says_what_each_skill_was_measured_to_do(run: RunDirectory) -> None:
     assert hop == ["hop", "25 %", "2", "5.0", "–", "–", "–", "–", "–", "–"]
 
 
-def test_it_says_how_to_load_it_and_what_is_not_there(run: RunDirectory) -> None:
+def test_it_says_how_to_load_it_and_what_is_not_there(run):
     page = card(run, "a film.gif", "b.mp4")
     assert 'run = sw.from_hub("ada/cart", hierarchy)' in page
     assert "ONNX files of hop" in page
@@ -92,7 +91,7 @@ def test_it_says_how_to_load_it_and_what_is_not_there(run: RunDirectory) -> None
     assert "secret" not in page
 
 
-def test_nothing_of_a_run_is_read_as_markdown_or_html(run: RunDirectory) -> None:
+def test_nothing_of_a_run_is_read_as_markdown_or_html(run):
     run.manifest.env_kwargs = {"x": "<script>alert(1)</script>|[a](http://b)\n# c"}
     run.manifest.env = '"\n---\n<b>'
     page = card(run)

@@ -43,7 +43,7 @@ def write_run(base: Path, to: Path, seed: int, returns: Sequence[float], agent: 
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A directory with four seeds of a hierarchy, and one with three of a flat agent."""
     found = tmp_path_factory.mktemp("curves")
     (found / "cart.py").write_text(RECIPE)
@@ -59,9 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
-def test_a_directory_of_runs_stands_for_its_runs_in_their_order(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_directory_of_runs_stands_for_its_runs_in_their_order(folder, tmp_path):
     runs = open_runs([folder / "sweep", folder / "flat" / "s1"])
     assert [run.path.name for run in runs] == ["s0", "s1", "s2", "s3", "s1"]
     for name in ("s10", "s9"):
@@ -73,7 +71,7 @@ def test_a_directory_of_runs_stands_for_its_runs_in_their_order(
         open_runs([])
 
 
-def test_the_median_and_the_quartiles_of_the_seeds_are_drawn(folder: Path, tmp_path: Path) -> None:
+def test_the_median_and_the_quartiles_of_the_seeds_are_drawn(folder, tmp_path):
     found = sw.plot_curves(folder / "sweep", tmp_path / "figure")
     (line,) = found.lines
     assert (found.metric, line.seeds, line.label) == ("return", 4, "cart")
@@ -81,8 +79,6 @@ def test_the_median_and_the_quartiles_of_the_seeds_are_drawn(folder: Path, tmp_p
     assert (line.steps[0], line.steps[-1]) == (512 + 128, 512 + 512)
     # Of 4, 8, 12 and 40 at the end, by hand.
     assert line.middle[-1] == 10
-    assert line.low is not None
-    assert line.high is not None
     assert (line.low[-1], line.high[-1]) == (7, 19)
     assert found.caption == "Lines: median of 4 seeds; bands: interquartile range."
     assert found.paths == (tmp_path / "figure.png", tmp_path / "figure.svg")
@@ -94,11 +90,10 @@ def test_the_median_and_the_quartiles_of_the_seeds_are_drawn(folder: Path, tmp_p
 
 
 @pytest.mark.slow
-def test_other_bands_agents_metrics_and_names(folder: Path, tmp_path: Path) -> None:
+def test_other_bands_agents_metrics_and_names(folder, tmp_path):
     runs = {"ours": folder / "sweep", "flat": [folder / "flat"]}
     found = plot_curves(runs, tmp_path / "a", band="range")
     assert [(line.label, line.seeds) for line in found.lines] == [("ours", 4), ("flat", 3)]
-    assert found.lines[0].high is not None
     assert found.lines[0].high[-1] == 40
     assert found.lines[1].steps[0] == 128  # no skills learnt before
     assert found.caption == "Lines: median of 3 to 4 seeds; bands: lowest to highest."
@@ -120,18 +115,14 @@ def test_other_bands_agents_metrics_and_names(folder: Path, tmp_path: Path) -> N
         ({"width": 0}, "width is 0; it must be from 1 to 40 inches"),
     ],
 )
-def test_what_cannot_be_drawn_is_told(
-    folder: Path, tmp_path: Path, how: dict[str, object], says: str
-) -> None:
+def test_what_cannot_be_drawn_is_told(folder, tmp_path, how, says):
     with pytest.raises(DeclarationError) as error:
         plot_curves(folder / "sweep", tmp_path / "x", **how)  # type: ignore[arg-type]
     assert says in str(error.value)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_figure_has_the_width_of_a_column_and_letters_of_eight_points(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_the_figure_has_the_width_of_a_column_and_letters_of_eight_points(folder, tmp_path):
     image = pytest.importorskip("PIL.Image")
     found = plot_curves([folder / "sweep", folder / "flat"], tmp_path / "a")
     with image.open(found.paths[0]) as opened:
@@ -140,9 +131,7 @@ def test_the_figure_has_the_width_of_a_column_and_letters_of_eight_points(
 
 
 @pytest.mark.slow
-def test_plot_and_compare_take_a_sweep(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_plot_and_compare_take_a_sweep(folder, tmp_path, capsys):
     out = tmp_path / "curves"
     words = ["plot", str(folder / "sweep"), str(folder / "flat"), "-o", str(out), "--json"]
     assert main([*words, "--label", "ours", "--label", "flat", "--band", "range"]) == 0
@@ -158,7 +147,7 @@ def test_plot_and_compare_take_a_sweep(
     assert "Comparison of 4 runs" in (tmp_path / "c.html").read_text()
 
 
-def test_tasks_of_0_and_1_are_drawn_in_percent(folder: Path, tmp_path: Path) -> None:
+def test_tasks_of_0_and_1_are_drawn_in_percent(folder, tmp_path):
     runs = shutil.copytree(folder / "sweep", tmp_path / "runs")
     before = plot_curves(runs, tmp_path / "a").paths[1].read_text()
     assert "episodes solved" not in before

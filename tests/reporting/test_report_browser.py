@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,7 @@ EVOLVE = ("left.population=2", "left.generations=2", "left.episodes=1")
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def pages(tmp_path_factory):
     """A report by hand, one of a run with a population, one unfinished, and a comparison."""
     folder = tmp_path_factory.mktemp("pages")
     run = declare().train(folder / "walk", quiet=True)
@@ -69,7 +68,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
+def browser():
     with playwright.sync_playwright() as started:
         chromium = started.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
         yield chromium
@@ -99,7 +98,7 @@ class Opened:
 
 
 @pytest.fixture
-def film(browser: Any, pages: dict[str, Path]) -> Iterator[Any]:
+def film(browser, pages):
     """The page made by hand, its film ready."""
     opened = Opened(browser, pages["walk"])
     opened.page.wait_for_function("document.getElementById('video').readyState >= 2")
@@ -123,9 +122,7 @@ def selected(page: Any) -> list[str]:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("name", ["walk", "evolved", "goals", "unfinished", "comparison"])
-def test_it_opens_without_errors_and_network_at_any_width(
-    browser: Any, pages: dict[str, Path], name: str, scheme: str
-) -> None:
+def test_it_opens_without_errors_and_network_at_any_width(browser, pages, name, scheme):
     opened = Opened(browser, pages[name], 1000, scheme)
     for width in (400, 700, 1000, 2000):
         opened.page.set_viewport_size({"width": width, "height": 800})
@@ -144,7 +141,7 @@ def test_it_opens_without_errors_and_network_at_any_width(
     opened.page.close()
 
 
-def test_a_cell_of_the_matrix_shows_its_calls(film: Any) -> None:
+def test_a_cell_of_the_matrix_shows_its_calls(film):
     film.wait_for_function("document.getElementById('pair-video').readyState >= 2")
     cells = json.loads(film.locator("#data").text_content())["handover"]
     buttons = film.locator("#pairs button")
@@ -165,7 +162,7 @@ def test_a_cell_of_the_matrix_shows_its_calls(film: Any) -> None:
             assert clip["from"] <= at * cells["film"]["fps"] <= clip["to"] + 1
 
 
-def test_a_film_that_is_paused_before_it_plays_says_nothing(film: Any) -> None:
+def test_a_film_that_is_paused_before_it_plays_says_nothing(film):
     film.locator("#pairs button").first.click()
     film.evaluate(
         """() => {
@@ -178,7 +175,7 @@ def test_a_film_that_is_paused_before_it_plays_says_nothing(film: Any) -> None:
     film.wait_for_timeout(200)
 
 
-def test_the_film_jumps_to_the_call_that_is_clicked(film: Any) -> None:
+def test_the_film_jumps_to_the_call_that_is_clicked(film):
     for place, first in ((0, 0), (1, 5 + HOLD)):
         for i, (skill, start, steps, *_) in enumerate(CALLS):
             film.click(f"#call-{place}-{i}")
@@ -193,7 +190,7 @@ def test_the_film_jumps_to_the_call_that_is_clicked(film: Any) -> None:
     assert "step 8 of 9 · go · return so far +21" in film.inner_text("#now")
 
 
-def test_the_picture_is_that_of_the_step(film: Any) -> None:
+def test_the_picture_is_that_of_the_step(film):
     red = """() => {
         const video = document.getElementById('video'), canvas = document.createElement('canvas');
         canvas.width = video.videoWidth; canvas.height = video.videoHeight;
@@ -211,7 +208,7 @@ def test_the_picture_is_that_of_the_step(film: Any) -> None:
         assert film.evaluate(red) == pytest.approx(metres / 6, abs=0.03)
 
 
-def test_keys_go_from_call_to_call_and_play(film: Any) -> None:
+def test_keys_go_from_call_to_call_and_play(film):
     film.focus("#timelines .track")
     for key, call in (
         ("Home", 0),
@@ -231,7 +228,7 @@ def test_keys_go_from_call_to_call_and_play(film: Any) -> None:
     film.wait_for_function("document.getElementById('video').paused")
 
 
-def test_an_episode_without_film_is_told_and_the_film_stays(film: Any) -> None:
+def test_an_episode_without_film_is_told_and_the_film_stays(film):
     film.click("#more summary")
     film.click("#call-0-1")
     before = shown_frame(film)
@@ -247,7 +244,7 @@ def test_an_episode_without_film_is_told_and_the_film_stays(film: Any) -> None:
     assert cells == ["4", "go", "7", "2", "by itself", "+11", "+4", "yes"]
 
 
-def test_a_call_is_shown_with_its_goal(browser: Any, pages: dict[str, Path]) -> None:
+def test_a_call_is_shown_with_its_goal(browser, pages):
     opened = Opened(browser, pages["goals"])
     call = opened.page.locator("#timelines .call").first
     call.click()
@@ -265,7 +262,7 @@ def test_a_call_is_shown_with_its_goal(browser: Any, pages: dict[str, Path]) -> 
     opened.page.close()
 
 
-def test_films_of_handovers_and_choices_name_goals(browser: Any, pages: dict[str, Path]) -> None:
+def test_films_of_handovers_and_choices_name_goals(browser, pages):
     opened = Opened(browser, pages["goals"])
     page, goal = opened.page, "(0.9, 0.9)"
     page.wait_for_function("document.getElementById('pair-video').readyState >= 2")
@@ -288,7 +285,7 @@ def test_films_of_handovers_and_choices_name_goals(browser: Any, pages: dict[str
     page.close()
 
 
-def test_charts_follow_what_is_chosen(browser: Any, pages: dict[str, Path]) -> None:
+def test_charts_follow_what_is_chosen(browser, pages):
     page = Opened(browser, pages["evolved"]).page
     page.select_option("#up", label="pole angle")
     page.wait_for_function("document.getElementById('choices').textContent.includes('pole angle')")

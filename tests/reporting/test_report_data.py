@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from reporting.cart import RECIPE
-from reporting.walkway import CALLS, Moody, Walkway, declare, told
+from reporting.walkway import CALLS, Moody, Walkway, declare, played, told
 
 from skillweave import EnvSpec, SkillweaveError
 from skillweave.cli import main
@@ -23,11 +22,11 @@ from skillweave.reporting.report.facts import transition_rows, transitions
 from skillweave.reporting.report.film import HOLD, episode_shot, make_film
 from skillweave.reporting.report.groups import grouped, on_one_grid, over_seeds
 from skillweave.runs.directory import RunDirectory
-from skillweave.training.evaluation import episode_seeds, evaluate
-from skillweave.training.played_calls import Episode, PlayedCalls, PlayedEpisodes
+from skillweave.training.evaluation import episode_seeds
+from skillweave.training.played_calls import Episode
 
 
-def test_transitions_by_hand(tmp_path: Path) -> None:
+def test_transitions_by_hand(tmp_path):
     run = declare().train(tmp_path / "run", quiet=True)
     skills = run.evaluate(2).skills
     assert transitions(skills) == [[2, 0, 0], [2, 2, 2], [2, 0, 0]]
@@ -39,16 +38,8 @@ def test_transitions_by_hand(tmp_path: Path) -> None:
     assert (stay["name"], stay["total"]) == ("stay", 2)
 
 
-def logged(tmp_path: Path, episodes: int = 2, env: Any = Walkway) -> PlayedEpisodes:
-    run = declare(env).train(tmp_path / "run", quiet=True)
-    spaces = run.policy.observation_space, run.policy.action_space
-    played = PlayedCalls(run.policy, spaces, own_rewards=True, inside=False)
-    evaluate(run.policy, run.declaration.spec, episodes=episodes, watch=played.add)
-    return PlayedEpisodes(played, episode_seeds(0, episodes))
-
-
-def test_calls_by_hand(tmp_path: Path) -> None:
-    log = logged(tmp_path)
+def test_calls_by_hand(tmp_path):
+    log = played(tmp_path / "run", 2)
     assert (log.labels, log.judged) == (("go", "stay"), (True, False))
     for i, episode in enumerate(log.episodes):
         assert told(episode.calls) == CALLS
@@ -57,8 +48,8 @@ def test_calls_by_hand(tmp_path: Path) -> None:
         assert (episode.total, episode.seed, episode.cut) == (27, episode_seeds(0, 2)[i], False)
 
 
-def test_many_calls_are_shown_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = logged(tmp_path, 3)
+def test_many_calls_are_shown_in_part(tmp_path, monkeypatch):
+    log = played(tmp_path / "run", 3)
     shown, missing = calls.episode_data(log, None)
     assert ([e["number"] for e in shown], missing) == ([1, 2, 3], [])
     assert told(shown[0]["calls"]) == CALLS
@@ -72,14 +63,14 @@ def test_many_calls_are_shown_in_part(tmp_path: Path, monkeypatch: pytest.Monkey
     ]
 
 
-def test_decisions_are_coordinates_and_calls(tmp_path: Path) -> None:
-    found = calls.decision_data(logged(tmp_path, 1))
+def test_decisions_are_coordinates_and_calls(tmp_path):
+    found = calls.decision_data(played(tmp_path / "run"))
     assert found["names"] == ["obs[0]", "obs[1]", "step of the episode"]
     assert found["rows"] == [[0, 0, 0], [2, 2, 2], [2, 5, 5], [4, 7, 7]]
     assert told(found["calls"]) == CALLS
 
 
-def test_coordinates_of_unlike_observations() -> None:
+def test_coordinates_of_unlike_observations():
     assert list(calls.coordinates(np.zeros(3, np.int64))) == ["obs"]
     assert list(calls.coordinates(np.zeros((3, 2, 2)))) == [f"obs[{i}]" for i in range(4)]
     assert calls.coordinates(np.zeros((3, 84, 84, 3), np.uint8)) == {}
@@ -89,7 +80,7 @@ def test_coordinates_of_unlike_observations() -> None:
     assert calls.coordinates(np.array([[np.inf], [0.0]])) == {}
 
 
-def test_filmed_are_the_worst_the_median_and_the_best() -> None:
+def test_filmed_are_the_worst_the_median_and_the_best():
     episodes = [
         Episode(i, np.zeros(1), np.array([r]), np.zeros(0))
         for i, r in enumerate([5.0, 1.0, 9.0, 3.0, 7.0])
@@ -99,9 +90,9 @@ def test_filmed_are_the_worst_the_median_and_the_best() -> None:
     assert sorted(calls.chosen_episodes(episodes, 9)) == [0, 1, 2, 3, 4]
 
 
-def test_a_film_says_where_each_episode_begins(tmp_path: Path) -> None:
+def test_a_film_says_where_each_episode_begins(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
-    log = logged(tmp_path)
+    log = played(tmp_path / "run", 2)
     shots = {i: episode_shot(log.episodes[i]) for i in (1, 0)}
     film = make_film(EnvSpec(Walkway, engine="sync"), shots)
     # Nine steps, a frame for two, and the end, which stands for HOLD frames.
@@ -110,9 +101,9 @@ def test_a_film_says_where_each_episode_begins(tmp_path: Path) -> None:
     assert film.data[4:8] == b"ftyp"
 
 
-def test_an_environment_that_does_not_repeat_itself_is_told(tmp_path: Path) -> None:
+def test_an_environment_that_does_not_repeat_itself_is_told(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
-    log = logged(tmp_path, env=Moody)
+    log = played(tmp_path / "run", env=Moody)
     with pytest.raises(EnvError, match="does not repeat itself"):
         make_film(EnvSpec(Moody, engine="sync"), {0: episode_shot(log.episodes[0])})
 
@@ -127,7 +118,7 @@ class Unseen(Walkway):
 
 
 @pytest.mark.slow
-def test_an_environment_without_pictures_has_no_film_and_all_the_rest(tmp_path: Path) -> None:
+def test_an_environment_without_pictures_has_no_film_and_all_the_rest(tmp_path):
     pytest.importorskip("vl_convert")
     run = declare(Unseen).train(tmp_path / "run", quiet=True)
     told = run.report(episodes=2)
@@ -140,13 +131,11 @@ def test_an_environment_without_pictures_has_no_film_and_all_the_rest(tmp_path: 
         run.report(episodes=0)
 
 
-def test_interquartile_means_and_intervals_over_seeds() -> None:
+def test_interquartile_means_and_intervals_over_seeds():
     alone = over_seeds(np.array([[1.0, 2.0]]))
-    assert (alone.mean.tolist(), alone.low, alone.high) == ([1, 2], None, None)
+    assert (alone.mean.tolist(), alone.low.tolist(), alone.bounds) == ([1, 2], [1, 2], {})
     many = np.random.default_rng(0).normal(5, 1, (40, 3))
     found = over_seeds(many)
-    assert found.low is not None
-    assert found.high is not None
     ordered = np.sort(many, axis=0)[10:30].mean(axis=0)
     np.testing.assert_allclose(found.mean, ordered)
     assert (found.low < found.mean).all()
@@ -155,33 +144,31 @@ def test_interquartile_means_and_intervals_over_seeds() -> None:
     width = (found.high - found.low) / 2
     assert ((width > 0.2) & (width < 0.6)).all()
     same = over_seeds(np.full(5, 3.0))
-    assert (same.mean, same.low, same.high) == (3, 3, 3)
+    assert (same.mean, same.bounds) == (3, {"low": 3, "high": 3})
 
 
-def test_groups_of_one_seed_have_no_interval_to_draw() -> None:
+def test_groups_of_one_seed_have_no_interval_to_draw():
     dot, bar = {"group": "A", "x": 1.0, "seed": 0}, {"group": "A", "x": 1.0}
-    alone = scores("A", ["#000"], {"dots": [dot], "bars": [bar]})
+    alone = scores("A", ["#000"], [dot], [bar])
     assert [layer["mark"]["type"] for layer in alone["layer"]] == ["point", "tick"]
-    several = scores("A", ["#000"], {"dots": [dot], "bars": [bar | {"low": 0.0, "high": 2.0}]})
+    several = scores("A", ["#000"], [dot], [bar | {"low": 0.0, "high": 2.0}])
     assert [layer["mark"]["type"] for layer in several["layer"]] == ["rule", "point", "tick"]
 
 
-def test_curves_of_several_seeds_on_one_grid() -> None:
-    found = on_one_grid([[(0, 0.0), (100, 10.0)], [(50, 5.0), (150, 25.0)]])
-    assert found is not None
-    grid, values = found
+def test_curves_of_several_seeds_on_one_grid():
+    grid, values = on_one_grid([[(0, 0.0), (100, 10.0)], [(50, 5.0), (150, 25.0)]])
     assert (grid[0], grid[-1]) == (50, 100)
     np.testing.assert_allclose(values[0], grid / 10)
     np.testing.assert_allclose(values[1], 5 + (grid - 50) / 5)
     assert on_one_grid([[(0, 0.0), (10, 1.0)], [(20, 0.0), (30, 1.0)]]) is None
 
 
-def test_thinned_keeps_the_last_point() -> None:
+def test_thinned_keeps_the_last_point():
     assert thinned(list(range(10)), 4) == [0, 3, 6, 9]
     assert thinned([1, 2], 4) == [1, 2]
 
 
-def test_a_word_on_a_colour_is_black_or_white() -> None:
+def test_a_word_on_a_colour_is_black_or_white():
     assert (charts.ink_on((255, 255, 255)), charts.ink_on((0, 0, 60))) == ("#000", "#fff")
     assert hex_of((1, 255, 16)) == "#01ff10"
 
@@ -190,7 +177,7 @@ def test_a_word_on_a_colour_is_black_or_white() -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Runs of one recipe: two seeds, one seed with another setting, and one unfinished."""
     found = tmp_path_factory.mktemp("runs")
     (found / "cart.py").write_text(RECIPE)
@@ -205,7 +192,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_groups_are_seeds_and_are_named_by_what_tells_them_apart(folder: Path) -> None:
+def test_groups_are_seeds_and_are_named_by_what_tells_them_apart(folder):
     runs = [RunDirectory.open(folder / name) for name in "abc"]
     first, second = grouped(runs)
     assert [r.manifest.seed for r in first.runs] == [0, 1]
@@ -217,7 +204,7 @@ def test_groups_are_seeds_and_are_named_by_what_tells_them_apart(folder: Path) -
 
 
 @pytest.mark.slow
-def test_curves_are_of_all_agents(folder: Path) -> None:
+def test_curves_are_of_all_agents(folder):
     curves = read_curves(RunDirectory.open(folder / "a"))
     assert [c.label for c in curves] == ["left", "balance", "selector"]
     steps = [x for x, _ in curves[0].points["policy_loss"]]
@@ -231,9 +218,7 @@ def report(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]
 
 
 @pytest.mark.slow
-def test_an_unfinished_run_is_shown_as_far_as_it_is(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unfinished_run_is_shown_as_far_as_it_is(folder, tmp_path, capsys):
     pytest.importorskip("vl_convert")
     out = tmp_path / "c.html"
     told = report(capsys, folder / "c", "-o", out)
@@ -250,9 +235,7 @@ def test_an_unfinished_run_is_shown_as_far_as_it_is(
     assert 'id="video"' not in text
 
 
-def test_without_the_recipe_the_report_says_so_and_shows_the_rest(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_the_recipe_the_report_says_so_and_shows_the_rest(folder, tmp_path, capsys):
     pytest.importorskip("vl_convert")
     pytest.importorskip("imageio_ffmpeg")
     out = tmp_path / "a.html"
@@ -272,7 +255,7 @@ def test_without_the_recipe_the_report_says_so_and_shows_the_rest(
     assert "<catch>" not in out.read_text()
 
 
-def test_errors_are_plain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_are_plain(tmp_path, capsys):
     for words in (["report", str(tmp_path)], ["compare", str(tmp_path)]):
         assert main(words) == 1
         assert f"{tmp_path} holds no run" in capsys.readouterr().err

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,11 +10,26 @@ import numpy as np
 import pytest
 from goals.worlds import SPACES, Drawn, GoTo, Rest, aim_of, declared
 
+from skillweave import Run
 from skillweave.reporting.report.calls import decision_data
 from skillweave.reporting.report.charts import choices
-from skillweave.reporting.report.handover import handover_section
-from skillweave.reporting.report.single import play_episodes
+from skillweave.reporting.report.handover import add_handover
+from skillweave.reporting.report.page import Page
+from skillweave.reporting.report.single import Played, play_episodes
 from skillweave.skills.goal_spaces import shown_goal
+
+
+def play(run: Run, episodes: int, num_envs: int = 2) -> tuple[Page, Played]:
+    page = Page()
+    return page, play_episodes(
+        page, run.policy, run.declaration.spec, episodes, 0, 0, True, num_envs
+    )
+
+
+def handover(*given: Any) -> dict[str, Any]:
+    page = Page()
+    add_handover(page, *given, filmed=True)
+    return page.data["handover"]["cells"]
 
 
 def walks(name: str, space: Any, left: float = 1.0) -> Any:
@@ -35,8 +49,8 @@ def chosen(obs: Any) -> Any:
     return np.array(["two", "number", "one", "other"])[kind], goals
 
 
-def test_each_kind_of_goals_has_its_picture(tmp_path: Path) -> None:
-    two = gym.spaces.Box(0, 1, (2,), np.float32)
+def test_each_kind_of_goals_has_its_picture(tmp_path):
+    two = gym.spaces.Box(-0.5, 1.5, (2,), np.float32)  # wider than the goals
     one = gym.spaces.Box(0, np.inf, (1,), np.float32)
     skills = [
         walks("two", two, left=0.0),
@@ -45,8 +59,8 @@ def test_each_kind_of_goals_has_its_picture(tmp_path: Path) -> None:
         walks("other", SPACES["dict"]),
     ]
     run = declared(skills, selector=chosen).train(tmp_path / "run", quiet=True)
-    played = play_episodes(run.policy, run.declaration.spec, 30, 0, 0, True, 4)
-    found = {picture["name"]: picture for picture in played.section.context["goals"]}
+    page, played = play(run, 30, 4)
+    found = {picture["name"]: picture for picture in page.context["goals"]}
     assert set(found) == {"two", "number", "one"}  # goals of a Dict have none
     for name, picture in found.items():
         rows = picture["spec"]["data"]["values"]
@@ -55,8 +69,10 @@ def test_each_kind_of_goals_has_its_picture(tmp_path: Path) -> None:
         assert calls == report.calls
         assert sum(row["done"] for row in rows) == report.succeeded
         assert picture["words"].startswith(f"{report.succeeded:,} of {report.calls:,} calls")
+    encoding = found["two"]["spec"]["encoding"]
+    assert [encoding[axis]["scale"]["domain"] for axis in "xy"] == [[-0.5, 1.5]] * 2
     rows = found["two"]["spec"]["data"]["values"]
-    assert all(0 <= row["x"] < row["x2"] <= 1 for row in rows)
+    assert all(-0.5 <= row["x"] < row["x2"] <= 1.5 for row in rows)
     left = [row["share"] for row in rows if row["x2"] <= 0.5]
     right = [row["share"] for row in rows if row["x"] >= 0.5]
     assert np.mean(left) < 0.3 < np.mean(right)
@@ -64,7 +80,7 @@ def test_each_kind_of_goals_has_its_picture(tmp_path: Path) -> None:
     assert max(row["x2"] for row in found["one"]["spec"]["data"]["values"]) <= 1.0
 
 
-def test_each_call_has_its_goal_in_words(tmp_path: Path) -> None:
+def test_each_call_has_its_goal_in_words(tmp_path):
     two, number = walks("two", SPACES["box"]), walks("number", SPACES["number"])
 
     def selector(obs: Any) -> Any:
@@ -72,9 +88,9 @@ def test_each_call_has_its_goal_in_words(tmp_path: Path) -> None:
         return names, {"two": obs.clip(-1, 1), "number": np.full(len(obs), 3)}
 
     run = declared([two, number, Rest()], selector=selector).train(tmp_path / "run", quiet=True)
-    played = play_episodes(run.policy, run.declaration.spec, 12, 0, 0, True, 4)
+    page, played = play(run, 12, 4)
     seen = set()
-    for shown, episode in zip(played.section.data["episodes"], played.log.episodes, strict=True):
+    for shown, episode in zip(page.data["episodes"], played.log.episodes, strict=True):
         for words, call in zip(shown["calls"]["goal"], episode.calls, strict=True):
             skill = played.log.labels[call["skill"]]
             goal = shown_goal(call["start"].clip(-1, 1)) if skill == "two" else "3"
@@ -83,7 +99,7 @@ def test_each_call_has_its_goal_in_words(tmp_path: Path) -> None:
     assert seen == {"two", "number", "rest"}
 
 
-def test_a_log_of_calls_has_pictures_of_its_own(tmp_path: Path) -> None:
+def test_a_log_of_calls_has_pictures_of_its_own(tmp_path):
     pytest.importorskip("vl_convert")
     inner = declared([walks("walk", SPACES["box"])], selector=passes_on)
     far = type("Far", (GoTo,), {"policy": inner, "max_steps": 8})()
@@ -107,17 +123,7 @@ def passes_on(obs: Any) -> Any:
     return ["walk"] * len(obs), obs["goal"]
 
 
-def test_the_map_of_goals_shows_their_whole_range(tmp_path: Path) -> None:
-    def selector(obs: Any) -> Any:
-        return ["two"] * len(obs), np.zeros((len(obs), 2))
-
-    run = declared([walks("two", SPACES["box"])], selector=selector).train(tmp_path / "run")
-    played = play_episodes(run.policy, run.declaration.spec, 4, 0, 0, True, 2)
-    encoding = played.section.context["goals"][0]["spec"]["encoding"]
-    assert [encoding[axis]["scale"]["domain"] for axis in "xy"] == [[-1, 1], [-1, 1]]
-
-
-def test_films_of_handovers_and_choices_name_goals(tmp_path: Path) -> None:
+def test_films_of_handovers_and_choices_name_goals(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     skills = [walks("two", SPACES["box"]), walks("other", SPACES["dict"]), Rest()]
 
@@ -129,8 +135,8 @@ def test_films_of_handovers_and_choices_name_goals(tmp_path: Path) -> None:
     run = declared(skills, env=Drawn, selector=selector).train(tmp_path / "run", quiet=True)
     log, spec = run.log_calls(400, num_envs=2), run.declaration.spec
     with_goals = {skill.name: skill for skill in skills[:2]}
-    section = handover_section(log, spec, {}, with_goals, filmed=True)
-    clips = [(c, clip) for c in section.data["handover"]["cells"].values() for clip in c["clips"]]
+    cells = handover(log, spec, {}, with_goals)
+    clips = [(cell, clip) for cell in cells.values() for clip in cell["clips"]]
     assert {cell["skill"] for cell, _ in clips} == {"two", "other", "rest"}
     for cell, clip in clips:
         for skill, goal in ((cell["skill"], "goal"), (cell["before"], "before_goal")):
@@ -138,10 +144,11 @@ def test_films_of_handovers_and_choices_name_goals(tmp_path: Path) -> None:
             assert re.fullmatch(form.get(skill, ""), clip[goal])
     logged = {shown_goal(goal.astype(np.float32)) for goal in log.goals["two"][log.skill == 0]}
     assert {clip["goal"] for cell, clip in clips if cell["skill"] == "two"} <= logged
-    none = handover_section(log, spec, {}, {}, filmed=True).data["handover"]["cells"]
-    assert {clip["goal"] for cell in none.values() for clip in cell["clips"]} == {""}
+    assert {
+        clip["goal"] for cell in handover(log, spec, {}, {}).values() for clip in cell["clips"]
+    } == {""}
 
-    played = play_episodes(run.policy, spec, 4, 0, 0, True, 2)
+    played = play(run, 4)[1]
     decisions = decision_data(played.log)
     goals = [goal for episode in played.log.episodes for goal in episode.calls["goal"]]
     assert decisions["calls"]["goal"] == goals
@@ -153,8 +160,7 @@ def test_films_of_handovers_and_choices_name_goals(tmp_path: Path) -> None:
     assert fields == [["what", "x", "y", "goal"], ["what", "x", "y"]]
 
 
-def test_a_report_without_goals_has_none(tmp_path: Path) -> None:
+def test_a_report_without_goals_has_none(tmp_path):
     rule = np.vectorize(lambda x: "rest")
     run = declared([Rest()], selector=lambda obs: rule(obs[:, 0])).train(quiet=True)
-    played = play_episodes(run.policy, run.declaration.spec, 2, 0, 0, True, 2)
-    assert played.section.context["goals"] == []
+    assert play(run, 2)[0].context["goals"] == []

@@ -15,7 +15,9 @@ import pytest
 
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, EnvError, MissingExtra, RunError
-from skillweave.reporting.video import PALETTE, VideoWriter, caption, color_of, render_policy
+from skillweave.reporting.palette import PALETTE, color_of
+from skillweave.reporting.video import caption, render_policy
+from skillweave.reporting.video_file import VideoWriter
 from skillweave.training.evaluation import evaluate
 from skillweave.types import Array, Memory, Step
 
@@ -86,6 +88,10 @@ def label(memory: Memory) -> tuple[str, tuple[int, int, int], str]:
     return ("walk", "run")[second], color_of(second), ""
 
 
+def render(env: Any, path: Path, policy: Any = None, **how: Any) -> dict[str, Any]:
+    return render_policy(EnvSpec(env), policy or Walker(), path, label, **how)
+
+
 def decode(path: Path) -> tuple[list[Array], list[int]]:
     """A GIF's frames, (H, W, 3) each, and how long each stands in milliseconds."""
     frames, durations = [], []
@@ -108,7 +114,7 @@ def luminance(color: tuple[int, int, int]) -> float:
     return float(linear @ (0.2126, 0.7152, 0.0722))
 
 
-def test_palette_is_distinct_and_readable_on_black_and_on_white() -> None:
+def test_palette_is_distinct_and_readable_on_black_and_on_white():
     for a, b in itertools.combinations(PALETTE, 2):
         assert np.abs(np.subtract(a, b)).max() > 40, (a, b)
     for color in PALETTE:
@@ -116,7 +122,7 @@ def test_palette_is_distinct_and_readable_on_black_and_on_white() -> None:
         assert 1.05 / (luminance(color) + 0.05) >= 1.9
 
 
-def test_colors_repeat_and_a_wish_wins() -> None:
+def test_colors_repeat_and_a_wish_wins():
     assert color_of(0) != color_of(1)
     assert color_of(len(PALETTE) + 1) == PALETTE[1]
     assert color_of(3, (0, 0, 0)) == (0, 0, 0)
@@ -124,7 +130,7 @@ def test_colors_repeat_and_a_wish_wins() -> None:
 
 @pytest.mark.parametrize("shape", [(400, 600), (64, 64), (84, 84), (210, 160), (721, 1281)])
 @pytest.mark.parametrize("ground", [0, 255])
-def test_caption_leaves_the_frame_and_shows_the_color(shape: tuple[int, int], ground: int) -> None:
+def test_caption_leaves_the_frame_and_shows_the_color(shape, ground):
     frame = np.full((*shape, 3), ground, np.uint8)
     frame[::7] = 99
     out = caption(frame, "landing", PALETTE[0], "step 132   return +87.4")
@@ -138,7 +144,7 @@ def test_caption_leaves_the_frame_and_shows_the_color(shape: tuple[int, int], gr
     assert has(band[:, out.shape[1] // 2 :], (255, 255, 255))
 
 
-def test_caption_tells_skills_steps_and_returns_apart() -> None:
+def test_caption_tells_skills_steps_and_returns_apart():
     frame = np.zeros((400, 600, 3), np.uint8)
     first = caption(frame, "landing", PALETTE[0], "step 1   return +0.5")
     assert (first != caption(frame, "hovering", PALETTE[0], "step 1   return +0.5")).any()
@@ -151,7 +157,7 @@ def test_caption_tells_skills_steps_and_returns_apart() -> None:
 
 
 @pytest.mark.parametrize("width", [60, 84, 240, 600])
-def test_a_long_name_never_reaches_the_text_on_the_right(width: int) -> None:
+def test_a_long_name_never_reaches_the_text_on_the_right(width):
     frame, text = np.zeros((width, width, 3), np.uint8), "step 1032   return -187.4"
     bare = caption(frame, "", PALETTE[1], text)
     named = caption(frame, "x" * 64, PALETTE[1], text)
@@ -161,13 +167,13 @@ def test_a_long_name_never_reaches_the_text_on_the_right(width: int) -> None:
     assert changed.max() < white.min()
 
 
-def test_captions_on_dark_chips_are_white_and_on_light_ones_black() -> None:
+def test_captions_on_dark_chips_are_white_and_on_light_ones_black():
     frame = np.zeros((400, 600, 3), np.uint8)
     for color, ink in (((0, 0, 120), (255, 255, 255)), ((250, 240, 200), (0, 0, 0))):
         assert has(caption(frame, "landing", color, "")[402:-2, 10:100], ink)
 
 
-def test_gif_holds_every_frame(tmp_path: Path) -> None:
+def test_gif_holds_every_frame(tmp_path):
     rng, path, written = np.random.default_rng(0), tmp_path / "a.gif", []
     frame = np.zeros((50, 70, 3), np.uint8)
     with VideoWriter(path, fps=30) as video:
@@ -186,7 +192,7 @@ def test_gif_holds_every_frame(tmp_path: Path) -> None:
     assert abs(sum(durations[:-1]) - 13 * 1000 / 30) <= 10
 
 
-def test_gif_shows_colors_that_its_first_frame_lacked(tmp_path: Path) -> None:
+def test_gif_shows_colors_that_its_first_frame_lacked(tmp_path):
     with VideoWriter(tmp_path / "a.gif", fps=10) as video:
         video.add(np.zeros((20, 20, 3), np.uint8))
         video.add(np.full((20, 20, 3), (200, 40, 90), np.uint8))
@@ -194,7 +200,7 @@ def test_gif_shows_colors_that_its_first_frame_lacked(tmp_path: Path) -> None:
     assert np.abs(frames[1].astype(int) - (200, 40, 90)).max() <= 32
 
 
-def test_gif_stores_only_what_changes(tmp_path: Path) -> None:
+def test_gif_stores_only_what_changes(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (100, 100, 3)).astype(np.uint8)
     sizes = []
     for n in (1, 50):
@@ -205,7 +211,7 @@ def test_gif_stores_only_what_changes(tmp_path: Path) -> None:
     assert sizes[1] < 1.5 * sizes[0]
 
 
-def test_mp4_holds_every_frame_and_repeats_a_held_one(tmp_path: Path) -> None:
+def test_mp4_holds_every_frame_and_repeats_a_held_one(tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     path = tmp_path / "deep" / "a.mp4"
     with VideoWriter(path, fps=10) as video:
@@ -223,9 +229,7 @@ def test_mp4_holds_every_frame_and_repeats_a_held_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_a_failed_write_leaves_the_old_file(
-    tmp_path: Path, suffix: str, error: type[BaseException]
-) -> None:
+def test_a_failed_write_leaves_the_old_file(tmp_path, suffix, error):
     if suffix == ".mp4":
         pytest.importorskip("imageio_ffmpeg")
     path = tmp_path / f"a{suffix}"
@@ -245,7 +249,7 @@ def test_a_failed_write_leaves_the_old_file(
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell script stands in for ffmpeg")
 @pytest.mark.parametrize("reads", ["cat > /dev/null;", ""])
-def test_when_ffmpeg_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reads: str) -> None:
+def test_when_ffmpeg_fails(tmp_path, monkeypatch, reads):
     pytest.importorskip("imageio_ffmpeg")
     fake, path = tmp_path / "ffmpeg", tmp_path / "a.mp4"
     fake.write_text(f"#!/bin/sh\n{reads} echo disk full >&2; exit 1\n")
@@ -264,7 +268,7 @@ def test_when_ffmpeg_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read
     assert {p.name for p in tmp_path.iterdir()} == {"a.mp4", "ffmpeg"}
 
 
-def test_bad_videos_are_named(tmp_path: Path) -> None:
+def test_bad_videos_are_named(tmp_path):
     with pytest.raises(RunError, match="no frames"), VideoWriter(tmp_path / "a.gif", 10):
         pass
     frame = np.zeros((8, 8, 3), np.uint8)
@@ -277,24 +281,22 @@ def test_bad_videos_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("suffix", "module"), [("gif", "PIL.Image"), ("mp4", "imageio_ffmpeg")])
-def test_a_missing_library_names_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, module: str
-) -> None:
+def test_a_missing_library_names_the_extra(tmp_path, monkeypatch, suffix, module):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingExtra, match=r"skillweave\[video\]"):
         VideoWriter(tmp_path / f"a.{suffix}", fps=10)
     assert not list(tmp_path.iterdir())
 
 
-def test_render_policy(tmp_path: Path) -> None:
-    made, policy = [], Walker()
+def test_render_policy(tmp_path):
+    made = []
 
     def corridor(render_mode: str | None = None) -> Corridor:
         made.append(Corridor(render_mode))
         return made[0]
 
     path = tmp_path / "a.gif"
-    result = render_policy(EnvSpec(corridor), policy, path, episodes=2, seed=5, label=label)
+    result = render(corridor, path, episodes=2, seed=5)
     episode = {"return": 7.0, "length": 7, "cut": False, "skills": {"walk": 3, "run": 4}}
     assert result == {"path": str(path), "frames": 10, "episodes": [episode, episode]}
     assert made[0].seeds == [5, 6]
@@ -310,82 +312,61 @@ def test_render_policy(tmp_path: Path) -> None:
         assert abs(int(frames[i][10, 10, 0]) - 255 * at // 7) <= 16
 
 
-def test_the_policy_is_told_every_step(tmp_path: Path) -> None:
-    policy = Walker()
-    render_policy(EnvSpec(Corridor), policy, tmp_path / "a.gif", deterministic=False)
-    assert [int(s.elapsed[0]) for s in policy.told] == list(range(1, 8))
-    assert [float(s.obs[0, 0]) for s in policy.told] == list(range(7))
-    assert [float(s.next_obs[0, 0]) for s in policy.told] == list(range(1, 8))
-    assert [bool(s.terminated[0]) for s in policy.told] == [False] * 6 + [True]
-    last = policy.told[-1]
-    for array in (last.reward, last.action, last.truncated, last.timed_out, last.info["at"]):
-        assert array.shape == (1,)
-    assert last.reward.dtype == np.float32
+def test_an_episode_is_cut_and_its_actions_are_sampled_where_that_is_asked(tmp_path):
+    path, policy = tmp_path / "a.gif", Walker()
+    result = render(Corridor, path, policy, max_steps=4, deterministic=False)
     assert not any(deterministic for deterministic, _ in policy.asked)
     assert isinstance(policy.asked[0][1], np.random.Generator)
-
-
-def test_max_steps_fps_and_every(tmp_path: Path) -> None:
-    path = tmp_path / "a.gif"
-    result = render_policy(EnvSpec(Corridor), Walker(), path, max_steps=4, fps=10, every=3)
-    assert result["episodes"] == [{"return": 4.0, "length": 4, "cut": True, "skills": {}}]
-    assert decode(path)[1] == [300, 300, 1000]
+    skills = {"walk": 3, "run": 1}
+    assert result["episodes"] == [{"return": 4.0, "length": 4, "cut": True, "skills": skills}]
+    assert decode(path)[1] == [100, 100, 1000]
     with pytest.raises(DeclarationError, match="at least 1"):
-        render_policy(EnvSpec(Corridor), Walker(), path, every=0)
+        render(Corridor, path, max_steps=0)
 
 
-def test_wide_frames_are_reduced(tmp_path: Path) -> None:
+def test_wide_frames_are_reduced(tmp_path):
     class Wide(Corridor):
         def render(self) -> Any:
             return np.zeros((500, 2000, 3), np.uint8)
 
-    render_policy(EnvSpec(Wide), Walker(), tmp_path / "a.gif", max_steps=1)
+    render(Wide, tmp_path / "a.gif", max_steps=1)
     assert decode(tmp_path / "a.gif")[0][0].shape[1] == 667
 
 
-def test_an_environment_without_frames(tmp_path: Path) -> None:
-    class Blind(Corridor):
-        def render(self) -> Any:
-            return None
-
-    with pytest.raises(EnvError, match="render"):
-        render_policy(EnvSpec(Blind), Walker(), tmp_path / "a.gif")
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize(
-    ("kind", "shape"),
-    [("f4", (64, 64, 3)), ("u1", (64, 64)), ("u1", (64, 64, 4)), ("u1", (0, 0, 3))],
+    "picture",
+    [
+        None,
+        np.ones((64, 64, 3), np.float32),
+        *(np.ones(shape, np.uint8) for shape in [(64, 64), (64, 64, 4), (0, 0, 3)]),
+    ],
 )
-def test_a_picture_that_is_not_rgb_is_refused_before_a_step(
-    tmp_path: Path, kind: str, shape: tuple[int, ...]
-) -> None:
+def test_a_picture_that_is_not_rgb_is_refused_before_a_step(tmp_path, picture):
     class Odd(Corridor):
         step: Any = None
 
         def render(self) -> Any:
-            return np.ones(shape, kind)
+            return picture
 
-    with pytest.raises(EnvError, match=r"Odd cannot be filmed.*uint8"):
-        render_policy(EnvSpec(Odd), Walker(), tmp_path / "a.gif")
+    says = "NoneType" if picture is None else "uint8"
+    with pytest.raises(EnvError, match=rf"Odd cannot be filmed: render\(\) gave .*{says}"):
+        render(Odd, tmp_path / "a.gif")
+    assert not list(tmp_path.iterdir())
 
 
-def test_an_environment_that_fails_to_draw_is_named(tmp_path: Path) -> None:
+def test_an_environment_that_fails_to_draw_is_named(tmp_path):
     class NoScreen(Corridor):
         def render(self) -> Any:
             raise RuntimeError("no light here.")
 
     told = r"NoScreen cannot be filmed: its render.. raised RuntimeError: no light here \(test_vid"
     with pytest.raises(EnvError, match=told) as caught:
-        render_policy(EnvSpec(NoScreen), Walker(), tmp_path / "a.gif")
+        render(NoScreen, tmp_path / "a.gif")
     assert isinstance(caught.value.__cause__, RuntimeError)
     assert "MuJoCo" not in str(caught.value)
-    assert not list(tmp_path.iterdir())
 
 
-def test_a_real_environment_without_a_display(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_real_environment_without_a_display(tmp_path, monkeypatch):
     pytest.importorskip("pygame")
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.setenv(name, "")  # so that monkeypatch restores it
@@ -395,7 +376,7 @@ def test_a_real_environment_without_a_display(
         def act(self, memory: Memory, obs: Array, mask: Any = None, **_: Any) -> Any:
             return np.zeros(1, np.int64), memory
 
-    result = render_policy(EnvSpec("CartPole-v1"), Left(), tmp_path / "a.gif", seed=1)
+    result = render("CartPole-v1", tmp_path / "a.gif", Left(), seed=1)
     if sys.platform == "linux":
         assert os.environ["SDL_VIDEODRIVER"] == "dummy"
     (episode,) = result["episodes"]
@@ -407,7 +388,7 @@ def test_a_real_environment_without_a_display(
     assert (frames[0][:400] != frames[-1][:400]).any()
 
 
-def test_a_film_shows_what_an_evaluation_plays(tmp_path: Path) -> None:
+def test_a_film_shows_what_an_evaluation_plays(tmp_path):
     """Dict observations, nested infos and rewards reach a policy as they do elsewhere."""
 
     class Rooms(Corridor):
@@ -433,9 +414,9 @@ def test_a_film_shows_what_an_evaluation_plays(tmp_path: Path) -> None:
             assert obs["at"].shape == (len(obs), 1)
             return obs["room"] % 2, memory
 
-    policies, spec = (Reader(), Reader()), EnvSpec(Rooms)
-    found = evaluate(policies[0], spec, episodes=1)
-    film = render_policy(spec, policies[1], tmp_path / "a.gif")
+    policies = Reader(), Reader()
+    found = evaluate(policies[0], EnvSpec(Rooms), episodes=1)
+    film = render(Rooms, tmp_path / "a.gif", policies[1])
     assert [e["return"] for e in film["episodes"]] == list(found.returns)
     told = [
         [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -9,6 +10,8 @@ import numpy as np
 
 from skillweave import EnvSpec, Hierarchy, Skill
 from skillweave.policies.core import CallEnd
+from skillweave.training.evaluation import episode_seeds, evaluate
+from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 from skillweave.types import Array
 
 
@@ -95,6 +98,15 @@ CALLS = [
 def told(calls: Any) -> list[tuple[Any, ...]]:
     """Return ``FIELDS`` of calls, as in ``CALLS``."""
     return list(zip(*(np.asarray(calls[name]).tolist() for name in FIELDS), strict=True))
+
+
+def played(folder: Path, episodes: int = 1, env: Any = Walkway) -> PlayedEpisodes:
+    """Train the walk, and play it."""
+    run = declare(env).train(folder, quiet=True)
+    spaces = run.policy.observation_space, run.policy.action_space
+    calls = PlayedCalls(run.policy, spaces, own_rewards=True, inside=False)
+    evaluate(run.policy, run.declaration.spec, episodes=episodes, watch=calls.add)
+    return PlayedEpisodes(calls, episode_seeds(0, episodes))
 
 
 def declare(env: Any = Walkway) -> Hierarchy:

@@ -74,8 +74,8 @@ def _episode(
         "totals": [rounded(total) for total in sums],
         "calls": page_calls(calls),
     }
-    _, observed = seen(calls, named)
-    return entry | ({"seen": observed} if observed else {})
+    observed = seen(calls, named)
+    return entry | ({"seen": rows_of(observed)} if observed else {})
 
 
 def page_calls(calls: Array) -> dict[str, list[Any]]:
@@ -93,9 +93,7 @@ def names_misfit(obs: Array, names: ObsNames | None) -> str | None:
     if isinstance(names, Mapping) != (obs.dtype.names is not None):
         kind = "a Dict" if obs.dtype.names is not None else "no Dict"
         return f"obs_names is not used: an observation is {kind}, and the names are not for one."
-    keys = obs.dtype.names or ()
-    parts = {k: obs[k] for k in keys} if isinstance(names, Mapping) else {"": obs}
-    named = names if isinstance(names, Mapping) else {"": names}
+    parts, named = _by_key(obs, names)
     for key, part_names in named.items():
         where = f" of {key!r}" if key else ""
         if key not in parts:
@@ -109,34 +107,34 @@ def names_misfit(obs: Array, names: ObsNames | None) -> str | None:
     return None
 
 
+def _by_key(obs: Array, names: ObsNames | None) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Return the parts of observations, and the names of their numbers; a flat one is of ""."""
+    keys = obs.dtype.names
+    parts = {"": obs} if keys is None else {key: obs[key] for key in keys}
+    return parts, dict(names) if isinstance(names, Mapping) else {"": names}
+
+
 def decision_data(log: PlayedEpisodes, named: ObsNames | None = None) -> dict[str, Any]:
     """Return the decisions: names of coordinates, a row of these for each, and its call.
 
     Only coordinates that vary are there; the episode's step is the last one.
     """
     calls = np.concatenate([episode.calls for episode in log.episodes])
-    every = -(-len(calls) // MOST_DECISIONS)
-    calls = calls[::every]
+    calls = calls[:: -(-len(calls) // MOST_DECISIONS)]
     columns = varying(coordinates(calls["start"], named))
     if columns:
         columns["step of the episode"] = calls["age"]
-    return {
-        "names": list(columns),
-        "rows": rows_of(columns),
-        "calls": page_calls(calls),
-        "every": every,
-    }
+    return {"names": list(columns), "rows": rows_of(columns), "calls": page_calls(calls)}
 
 
-def seen(calls: Array, named: ObsNames | None) -> tuple[list[str], list[list[float | None]]]:
-    """Return the names of the numbers observed at the starts of calls, and their values.
+def seen(calls: Array, named: ObsNames | None) -> dict[str, Array]:
+    """Return the numbers observed at the starts of calls by name, (n,) each.
 
-    Both are empty if observations have no names, or more numbers than fit on the page.
+    There are none if observations have no names, or more numbers than fit on the page.
     """
     columns = {} if named is None else coordinates(calls["start"], named)
     columns = {name: v for name, v in columns.items() if not name.startswith("obs[")}
-    columns = {} if len(columns) > MOST_COORDINATES else columns
-    return list(columns), rows_of(columns)
+    return {} if len(columns) > MOST_COORDINATES else columns
 
 
 def rows_of(columns: Mapping[str, Array]) -> list[list[float | None]]:
@@ -160,14 +158,10 @@ def coordinates(obs: Array, names: ObsNames | None = None) -> dict[str, Array]:
     Args:
         names: names for the numbers, where there are as many; see ``names_misfit``.
     """
-    named = names if isinstance(names, Mapping) else {}
-    if obs.dtype.names is not None:
-        keys = obs.dtype.names
-        parts = [(f'obs["{key}"]', obs[key], named.get(key)) for key in keys]
-    else:
-        parts = [("obs", obs, None if isinstance(names, Mapping) else names)]
+    parts, named = _by_key(obs, names)
     columns: dict[str, Array] = {}
-    for name, part, part_names in parts:
+    for key, part in parts.items():
+        name, part_names = f'obs["{key}"]' if key else "obs", named.get(key)
         if part.dtype.names is not None:
             continue  # a Dict in a Dict
         flat = np.asarray(part).reshape(len(part), -1)

@@ -6,7 +6,7 @@ it (https://vega.github.io/vega-lite/docs/).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from skillweave.reporting.lineage import Lineage, changes_words, number_of, setting_title
@@ -36,11 +36,11 @@ def number_axis(field: str, title: str, **rest: Any) -> dict[str, Any]:
     return {"field": field, "type": "quantitative", "title": title, "scale": scale} | rest
 
 
-def steps_axis(field: str = "x", title: str = STEPS) -> dict[str, Any]:
+def steps_axis() -> dict[str, Any]:
     """Return the encoding of steps: 200k, 1M."""
     label = "datum.value === 0 ? '0' : format(datum.value, '~s')"
     axis = {"labelExpr": label, "tickCount": 5, "labelOverlap": True}
-    return number_axis(field, title, axis=axis, scale={"zero": True, "nice": False})
+    return number_axis("x", STEPS, axis=axis, scale={"zero": True, "nice": False})
 
 
 def generation_axis() -> dict[str, Any]:
@@ -211,27 +211,19 @@ def family_tree(lineage: Lineage, color: str) -> Spec:
     return chart("Fitness by generation, and the line of the winner", 320, layer=layers)
 
 
-def setting_paths(lineage: Lineage, color: str) -> list[tuple[str, Spec]]:
-    """Return a chart for each setting that differed: its values by generation."""
-    return [(name, _setting(name, lineage, color)) for name in lineage.varied]
+def setting_path(name: str, lineage: Lineage, color: str) -> Spec:
+    """Return a chart of a setting's values by generation."""
 
-
-def _setting(name: str, lineage: Lineage, color: str) -> Spec:
-    everyone = list(lineage.born.values())
-    words = any(isinstance(b.settings[name], str) for b in everyone)
-
-    def rows(members: Sequence[LineageLine]) -> list[dict[str, Any]]:
-        values = [b.settings[name] if words else number_of(b, name) for b in members]
-        return [{"x": b.generation + 1, "y": v} for b, v in zip(members, values, strict=True)]
+    def rows(members: Iterable[LineageLine]) -> list[dict[str, Any]]:
+        return [{"x": b.generation + 1, "y": number_of(b, name)} for b in members]
 
     y: dict[str, Any] = {"field": "y", "type": "nominal", "title": None}
-    if not words:
-        values = [number_of(b, name) for b in everyone]
-        log = min(values) > 0 and max(values) > 5 * min(values)
-        y = number_axis("y", "", scale={"type": "log"} if log else {}, axis={"tickCount": 4})
+    if (scale := lineage.scale(name)) != "words":
+        log = {"type": "log"} if scale == "log" else {}
+        y = number_axis("y", "", scale=log, axis={"tickCount": 4})
     bold = marks("line", point={"size": 35, "color": color}, strokeWidth=2, color=color)
     layers = [
-        layer(marks("circle", size=20, color=FAINT), rows(everyone)),
+        layer(marks("circle", size=20, color=FAINT), rows(lineage.born.values())),
         layer(bold, rows(lineage.path(lineage.winner))),
     ]
     encoding = {"x": generation_axis(), "y": y}
@@ -253,15 +245,24 @@ def ink_on(color: RGB) -> str:
 
 
 def scores(
-    names: Sequence[str], colors: Sequence[str], rows: dict[str, Any], binary: bool = False
+    names: Sequence[str],
+    colors: Sequence[str],
+    dots: Sequence[dict[str, Any]],
+    bars: Sequence[dict[str, Any]],
+    *,
+    binary: bool = False,
 ) -> Spec:
     """Return a chart with a dot for each run, and each group's interquartile mean and interval.
 
     Args:
+        names: of the groups.
+        colors: of each group.
+        dots: rows of runs.
+        bars: rows of groups, with ``low`` and ``high`` where there is an interval.
         binary: returns are 0 or 1, so that their mean is the share of episodes that are solved.
     """
     what, form = ("episodes solved", ".0%") if binary else ("mean return", ",.4~r")
-    y: dict[str, Any] = {"field": "group", "type": "nominal", "title": None, "sort": list(names)}
+    y: dict[str, Any] = {"field": "group", "type": "nominal", "title": None, "sort": names}
     y["axis"] = {"labelFontSize": 14, "labelFontWeight": "bold"}
     of_group = {"y": y, "color": group_color("group", names, colors)}
     axis: dict[str, Any] = {"tickCount": 8} | ({"format": "%"} if binary else {})
@@ -270,16 +271,14 @@ def scores(
     of_bar = of_group | {"tooltip": tips(("group",), *fields)}
     of_run = tips(("group",), ("seed",), ("x", what, form))
     between = {"x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}}
-    bars = rows["bars"]
-    valid = {"transform": [{"filter": "isValid(datum.low)"}]}
-    dot = marks("point", size=50, strokeWidth=1.5)
     layers = [
-        valid | layer(marks("rule", strokeWidth=5, opacity=0.5), bars, **between, **of_bar),
-        layer(dot, rows["dots"], x=x, **of_group, tooltip=of_run),
+        layer(marks("point", size=50, strokeWidth=1.5), dots, x=x, **of_group, tooltip=of_run),
         layer(marks("tick", thickness=4, size=22), bars, x=x, **of_bar),
     ]
-    if not any("low" in bar for bar in bars):
-        del layers[0]  # an axis over nothing is warned of
+    if any("low" in bar for bar in bars):  # an axis over nothing is warned of
+        valid = {"transform": [{"filter": "isValid(datum.low)"}]}
+        rule = marks("rule", strokeWidth=5, opacity=0.5)
+        layers.insert(0, valid | layer(rule, bars, **between, **of_bar))
     return chart("Scores by group", 50 + 40 * len(names), layer=layers)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,12 @@ from skillweave.reporting.report.facts import (
 )
 from skillweave.reporting.report.groups import (
     Group,
-    OverSeeds,
     differences,
     grouped,
     on_one_grid,
     over_seeds,
 )
-from skillweave.reporting.report.page import library, write_page
+from skillweave.reporting.report.page import Page, library
 from skillweave.reporting.report.verdict import is_binary, solved_share
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
@@ -53,119 +51,94 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
         RunError: a run is damaged, or the file cannot be written.
         MissingExtra: the extra 'report' is not installed.
     """
-    began = time.perf_counter()
+    page = Page()
     library()
     groups = grouped(runs)
-    saved = {run.path: load_evaluation(run) for run in runs}
-    scores = [[s.evaluation for run in g.runs if (s := saved[run.path])] for g in groups]
-    summaries = [over_seeds([e.mean for e in some]) if some else None for some in scores]
-    curves_of = {run.path: read_curves(run) for run in runs}
-    all_curves = [c for curves in curves_of.values() for c in curves]
-    colors = [hex_of(color_of(i)) for i in range(len(groups))]
-    keys = [group.key for group in groups]
-    say = _sayer([r for some in scores for e in some for r in e.returns])
-    binary = say is percent
-    data: dict[str, Any] = {"curves": _curves(groups, curves_of, colors), "charts": {}}
-    if any(scores):
-        rows = _score_rows(groups, saved, summaries)
-        data["charts"] = {"scores-chart": charts.scores(keys, colors, rows, binary)}
-    missing = _missing(runs, saved)
     differ = differences(groups)
-    context = {
+    saved = {run.path: load_evaluation(run) for run in runs}
+    curves_of = {run.path: read_curves(run) for run in runs}
+    colors = [hex_of(color_of(i)) for i in range(len(groups))]
+    returns = [r for s in saved.values() if s is not None for r in s.evaluation.returns]
+    binary = bool(returns) and is_binary(returns)
+    say = percent if binary else functools.partial(number, scale=scale_of(returns))
+    page.missing += _missing(runs, saved)
+    page.data["curves"] = _curves(groups, curves_of, colors)
+    page.context = {
         "title": f"Comparison of {len(runs)} runs",
-        "groups": [_group_words(g, s, say) for g, s in zip(groups, summaries, strict=True)],
         "binary": binary,
-        "legend": [(g.key, g.name, c) for g, c in zip(groups, colors, strict=True)],
-        "has_scores": any(scores),
-        "skills": [
-            (g.key, g.name, skill_rows, _followed([e.skills for e in some]))
-            for g, some in zip(groups, scores, strict=True)
-            if (skill_rows := _skill_rows([e.to_json()["skills"] for e in some]))
-        ],
         "runs": [_run_row(g, run, saved[run.path], say) for g in groups for run in g.runs],
         "differences": differ[:MOST_DIFFERENCES],
         "more_differences": max(0, len(differ) - MOST_DIFFERENCES),
-        "curves": [c["label"] for c in data["curves"]],
-        "metrics": metrics_of(all_curves),
-        "missing": missing,
+        "metrics": metrics_of([c for curves in curves_of.values() for c in curves]),
     }
-    written = write_page(path, "compare.html", context, data)
-    return written | {"seconds": round(time.perf_counter() - began, 2), "missing": missing}
+    _add_groups(page, groups, colors, saved, say)
+    return page.write(path, "compare.html") | {"missing": page.missing}
 
 
-Saved = dict[Path, SavedEvaluation | None]
+Saved = Mapping[Path, SavedEvaluation | None]
 Say = Callable[[float | None], str]
-"""Write a return for people."""
-
-
-def _sayer(returns: Sequence[float]) -> Say:
-    """Return the writer of returns: as percent where all are 0 or 1, else to one scale."""
-    if returns and is_binary(returns):
-        return percent
-    return functools.partial(number, scale=scale_of(returns))
+"""Write a number for people; returns are percent where all are 0 or 1, else to one scale."""
 
 
 def _missing(runs: Sequence[RunDirectory], saved: Saved) -> list[str]:
+    """Return sentences on runs without an evaluation, and on evaluations that differ."""
     sentences = []
     for run in runs:
         if not run.finished:
             sentences.append(
-                f"{run.path} is not finished; to finish it: {command_words('resume', run)}"
+                f"{run.path} is not finished; to finish it: {command_words('resume', run)}."
             )
         elif saved[run.path] is None:
             sentences.append(
-                f"{run.path} has no evaluation; to make one: {command_words('evaluate', run)}"
+                f"{run.path} has no evaluation; to make one: {command_words('evaluate', run)}."
             )
-    played = {
-        (e.seed, e.deterministic, len(e.evaluation.returns))
-        for e in saved.values()
-        if e is not None
-    }
-    if len(played) > 1:
+    if len({(s.seed, s.deterministic, len(s.evaluation.returns)) for s in saved.values() if s}) > 1:
         sentences.append(
             "The evaluations are not of the same episodes: their seeds, their numbers of episodes, "
-            "or whether actions were sampled differ"
+            "or whether actions were sampled differ."
         )
-    return [f"{line}." for line in sentences]
+    return sentences
 
 
-def _group_words(group: Group, summary: OverSeeds | None, say: Say) -> dict[str, Any]:
-    seeds = ", ".join(str(run.manifest.seed) for run in group.runs)
-    words = {"key": group.key, "name": group.name, "seeds": seeds, "count": len(group.runs)}
-    if summary is None:
-        return words | {"iqm": None}
-    interval = summary.interval(say) or "one seed: no interval"
-    return words | {"iqm": say(float(summary.mean)), "interval": interval}
+def _add_groups(
+    page: Page, groups: Sequence[Group], colors: Sequence[str], saved: Saved, say: Say
+) -> None:
+    """Put the groups into the page: their scores, with a chart, and the figures of their skills."""
+    page.context["groups"], dots, bars = [], [], []
+    for group, color in zip(groups, colors, strict=True):
+        scored = [(run, s.evaluation) for run in group.runs if (s := saved[run.path]) is not None]
+        words: dict[str, Any] = {"key": group.key, "name": group.name, "color": color}
+        words["seeds"] = ", ".join(str(run.manifest.seed) for run in group.runs)
+        words |= {"count": len(group.runs), "iqm": None, "skills": ()}
+        page.context["groups"].append(words)
+        if scored:
+            summary = over_seeds([score.mean for _, score in scored])
+            dots += [
+                {"group": group.key, "x": score.mean, "seed": run.manifest.seed}
+                for run, score in scored
+            ]
+            bars.append({"group": group.key, "x": float(summary.mean)} | summary.bounds)
+            words |= {
+                "iqm": say(float(summary.mean)),
+                "interval": summary.interval(say) or "one seed: no interval",
+                "skills": _skill_rows([score.to_json()["skills"] for _, score in scored]),
+                "followed": _followed([score.skills for _, score in scored]),
+            }
+    page.data["charts"] = {}
+    if dots:
+        keys = [group.key for group in groups]
+        spec = charts.scores(keys, colors, dots, bars, binary=page.context["binary"])
+        page.data["charts"]["scores-chart"] = spec
 
 
-def _score_rows(
-    groups: list[Group], saved: Saved, summaries: list[OverSeeds | None]
-) -> dict[str, Any]:
-    """Return the rows of the chart of scores: a dot for each run, a bar for each group."""
-    dots = [
-        {"group": group.key, "x": score.evaluation.mean, "seed": run.manifest.seed}
-        for group in groups
-        for run in group.runs
-        if (score := saved[run.path]) is not None
-    ]
-    bars = []
-    for group, summary in zip(groups, summaries, strict=True):
-        if summary is not None:
-            bar = {"group": group.key, "x": float(summary.mean)}
-            if summary.low is not None and summary.high is not None:
-                bar |= {"low": float(summary.low), "high": float(summary.high)}
-            bars.append(bar)
-    return {"dots": dots, "bars": bars}
-
-
-FIGURES: dict[str, tuple[str, Say]] = {
-    "share": ("share", percent),
-    "calls": ("calls", number),
-    "length": ("length_mean", number),
-    "success": ("success_rate", percent),
-    "return": ("return_mean", number),
+FIGURES: dict[str, Say] = {
+    "share": percent,
+    "calls": number,
+    "length_mean": number,
+    "success_rate": percent,
+    "return_mean": number,
 }
-"""Columns of the table of skills, with a field of their reports and how it is written."""
+"""Columns of the table of skills: fields of their reports, and how each is written."""
 
 
 def _skill_rows(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
@@ -173,8 +146,8 @@ def _skill_rows(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     return [
         {"name": name}
         | {
-            column: _over_seeds([skills[name][key] for skills in reports if name in skills], say)
-            for column, (key, say) in FIGURES.items()
+            key: _over_seeds([skills[name][key] for skills in reports if name in skills], say)
+            for key, say in FIGURES.items()
         }
         for name in dict.fromkeys(k for skills in reports for k in skills)
     ]
@@ -186,13 +159,14 @@ def _followed(evaluated: Sequence[Mapping[str, SkillReport]]) -> list[dict[str, 
     reports = [levels_of(skills).get("", {}) for skills in evaluated]
     counts = [transitions(skills) for skills in reports]
     known = [c for c in counts if c is not None]
-    if not known or len(known) < len(counts):
+    if len(known) < len(counts):
         return []
     rows: list[list[int]] = np.sum(known, axis=0).tolist()
     return transition_rows(list(reports[0]), rows)
 
 
 def _over_seeds(values: Sequence[float | None], say: Say) -> str:
+    """Return a skill's figure over seeds in words; unknown values are left out."""
     known = [v for v in values if v is not None]
     if not known:
         return NOTHING
@@ -206,31 +180,35 @@ def _over_seeds(values: Sequence[float | None], say: Say) -> str:
 def _run_row(
     group: Group, run: RunDirectory, saved: SavedEvaluation | None, say: Say
 ) -> dict[str, str]:
-    score = None if saved is None else saved.evaluation.to_json()
+    """Return a run in words, with its score where it has been evaluated."""
     stages = run.manifest.stages
-    return {
+    row = {
         "run": facts.name_of(run),
         "group": group.key,
         "seed": str(run.manifest.seed),
         "status": "finished" if run.finished else "not finished",
         "steps": f"{sum(s.steps or 0 for s in stages):,}",
         "seconds": f"{sum(s.seconds or 0.0 for s in stages):,.0f}",
-        "mean": say(None if saved is None else saved.evaluation.mean),
-        "iqm": say(None if score is None else score["iqm"]),
-        "solved": percent(None if saved is None else solved_share(saved.evaluation)),
-        "length": NOTHING if score is None else f"{score['length_mean']:,.1f}",
-        "episodes": NOTHING if saved is None else str(len(saved.evaluation.returns)),
+    }
+    if saved is None:
+        return row | dict.fromkeys(("mean", "iqm", "solved", "length", "episodes"), NOTHING)
+    score, score_json = saved.evaluation, saved.to_json()
+    return row | {
+        "mean": say(score.mean),
+        "iqm": say(score_json["iqm"]),
+        "solved": percent(solved_share(score)),
+        "length": f"{score_json['length_mean']:,.1f}",
+        "episodes": str(len(score.returns)),
     }
 
 
 def _curves(
-    groups: Sequence[Group], curves_of: dict[Path, list[Curves]], colors: Sequence[str]
+    groups: Sequence[Group], curves_of: Mapping[Path, Sequence[Curves]], colors: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Return a chart for each agent of any group, with a line and a band for each group."""
-    labels = dict.fromkeys(c.label for curves in curves_of.values() for c in curves)
     keys = [group.key for group in groups]
-    charts_ = []
-    for label in labels:
+    shown = []
+    for label in dict.fromkeys(c.label for curves in curves_of.values() for c in curves):
         points: dict[str, list[list[Any]]] = {}
         for group in groups:
             curves = [c for run in group.runs for c in curves_of[run.path] if c.label == label]
@@ -238,8 +216,8 @@ def _curves(
                 points_of = [c.points[metric] for c in curves if metric in c.points]
                 points.setdefault(metric, []).extend(_line(group.key, points_of))
         spec = charts.group_curves(label, keys, colors)
-        charts_.append({"label": label, "spec": spec, "points": points})
-    return charts_
+        shown.append({"label": label, "spec": spec, "points": points})
+    return shown
 
 
 def _line(name: str, curves: list[list[tuple[int, float]]]) -> list[list[Any]]:
@@ -247,11 +225,8 @@ def _line(name: str, curves: list[list[tuple[int, float]]]) -> list[list[Any]]:
     gridded = on_one_grid(curves)
     if gridded is None:
         return []
-    grid, values = gridded
-    summary = over_seeds(values)
-    low = summary.mean if summary.low is None else summary.low
-    high = summary.mean if summary.high is None else summary.high
+    summary = over_seeds(gridded[1])
     return [
-        [int(x), *map(rounded, values_at), name]
-        for x, *values_at in zip(grid, summary.mean, low, high, strict=True)
+        [int(x), *map(rounded, values), name]
+        for x, *values in zip(gridded[0], summary.mean, summary.low, summary.high, strict=True)
     ]

@@ -35,18 +35,12 @@ def number(value: float | None, scale: float | None = None) -> str:
     size = abs(value) if scale is None else abs(scale)
     if value and (size < 10**-MOST_DECIMALS or abs(value) >= 1e9):
         return f"{value:.{DIGITS - 1}e}".replace("-", "−")
-    places = decimals(size)
+    places = DIGITS - 1 - math.floor(math.log10(size)) if size > 0 else 0
+    places = min(max(places, 0), MOST_DECIMALS)
     text = f"{round(value, places) + 0.0:,.{places}f}"
     if scale is None and "." in text:
         text = text.rstrip("0").rstrip(".")
     return text.replace("-", "−")
-
-
-def decimals(size: float) -> int:
-    """Return how many decimals a number of this size needs for three significant digits."""
-    if size <= 0:
-        return 0
-    return min(max(DIGITS - 1 - math.floor(math.log10(size)), 0), MOST_DECIMALS)
 
 
 def scale_of(values: Iterable[float | None]) -> float:
@@ -72,8 +66,16 @@ def span(bounds: Iterable[Any], say: Callable[[float], str] = percent) -> str:
 
 # Runs and stages
 
-LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
-MADE = {
+RESULTS = {
+    "name",
+    "status",
+    "starts",
+    "final",
+    "sha256",
+    "policies",
+    "metrics_bytes",
+    "lineage_bytes",
+    "winner",
     "steps",
     "seconds",
     "steps_per_second",
@@ -88,7 +90,8 @@ MADE = {
     "best",
     "continued",
 }
-"""Fields of a stage's entry that training wrote, or that follow from the hierarchy's settings."""
+"""Fields of a stage's entry that are no settings: training wrote them, or they follow from the
+hierarchy's settings."""
 OF_CODE = ("selector", "guide")
 """Fields of the outermost hierarchy's entry that are no settings."""
 
@@ -101,21 +104,26 @@ def name_of(run: RunDirectory) -> str:
 def facts(run: RunDirectory) -> list[tuple[str, str]]:
     """Return facts about the training, by name."""
     manifest = run.manifest
-    rows = [("Environment", manifest.env)]
-    if manifest.env_kwargs:
-        rows.append(("Made with", plain(manifest.env_kwargs)))
-    rows.append(("Recipe", manifest.recipe or "declared in Python"))
-    rows += [("Seed", str(manifest.seed)), ("Made", manifest.created.replace("T", " "))]
+    rows = [
+        ("Environment", manifest.env),
+        ("Made with", plain(manifest.env_kwargs) if manifest.env_kwargs else ""),
+        ("Recipe", manifest.recipe or "declared in Python"),
+        ("Seed", str(manifest.seed)),
+        ("Made", manifest.created.replace("T", " ")),
+    ]
     if (level := manifest.hierarchy) is not None:
-        rows.append(("Skills", ", ".join(manifest.by_path)))
-        rows.append(("A call lasts", _call_length(level)))
-        rows.append(("Selector", f"ready: {level.selector.kind}" if level.selector else "trained"))
-        rows.append(("Learning", level.learn))
-        if level.interrupt is not None:
-            rows.append(("Calls are cut at", f"{level.interrupt} deviations"))
-        if level.reflexes:
-            rows.append(("Reflexes", ", ".join(level.reflexes)))
-    return rows
+        rows += [
+            ("Skills", ", ".join(manifest.by_path)),
+            ("A call lasts", _call_length(level)),
+            ("Selector", f"ready: {level.selector.kind}" if level.selector else "trained"),
+            ("Learning", level.learn),
+            (
+                "Calls are cut at",
+                "" if level.interrupt is None else f"{level.interrupt} deviations",
+            ),
+            ("Reflexes", ", ".join(level.reflexes)),
+        ]
+    return [(name, fact) for name, fact in rows if fact]
 
 
 def _call_length(level: LevelEntry) -> str:
@@ -191,8 +199,7 @@ def settings(manifest: Manifest) -> dict[str, Any]:
         fields = {k: v for k, v in as_json(skill).items() if k != "name"}
         values |= flat(fields, f"skills.{skill.name}.")
     for entry in manifest.stages:
-        left_out = LEFT_OUT | MADE | {"name", "starts"}
-        fields = {k: v for k, v in as_json(entry).items() if k not in left_out}
+        fields = {k: v for k, v in as_json(entry).items() if k not in RESULTS}
         # From which run differs from seed to seed.
         fields |= {f"starts.{name}": "another run" for name in entry.starts}
         values |= flat(fields, f"{entry.name}.")

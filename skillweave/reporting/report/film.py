@@ -73,10 +73,10 @@ def episode_shot(episode: Episode) -> Shot:
 def make_film(
     spec: EnvSpec,
     shots: Mapping[int, Shot],
-    *,
     most_frames: int = MOST_FRAMES,
     most_bytes: int = MOST_BYTES,
     check_spaces: Callable[[gym.Space[Any], gym.Space[Any]], None] | None = None,
+    *,
     quiet: bool = True,
 ) -> Film:
     """Play shots again, one after another, and film them.

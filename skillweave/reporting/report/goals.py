@@ -61,31 +61,29 @@ def _rows(
     Without parts the space has no picture; without ranges the parts are choices.
     """
     if isinstance(space, gym.spaces.Discrete) and space.n <= MOST_GOALS:
+        chosen = goals[:, 0]
         return [
-            {"x": str(int(value))} | _counted(done[goals[:, 0] == value])
-            for value in np.unique(goals[:, 0])
+            {"x": str(int(value))} | _counted(done[chosen == value].sum(), (chosen == value).sum())
+            for value in np.unique(chosen)
         ], []
     if not isinstance(space, gym.spaces.Box) or goals.shape[1] not in (1, 2):
         return [], []
-    numbers = goals.shape[1]
-    count = int(np.clip((len(goals) / CALLS_OF_A_PART) ** (1 / numbers), 2, MOST_PARTS))
-    edges = [_edges(space, goals[:, i], i, count) for i in range(numbers)]
-    at = [
-        np.clip(np.searchsorted(edge, goals[:, i], side="right") - 1, 0, len(edge) - 2)
-        for i, edge in enumerate(edges)
-    ]
+    count = int(np.clip((len(goals) / CALLS_OF_A_PART) ** (1 / goals.shape[1]), 2, MOST_PARTS))
+    edges = [_edges(space, values, i, count) for i, values in enumerate(goals.T)]
+    ranges = [[float(edge[0]), float(edge[-1])] for edge in edges]
+    inside = np.clip(goals, *np.transpose(ranges))
+    calls, won = (np.histogramdd(inside, edges, weights=w)[0] for w in (None, done))
     rows = []
-    for place in sorted(set(zip(*(x.tolist() for x in at), strict=True))):
-        inside = np.logical_and.reduce([x == p for x, p in zip(at, place, strict=True)])
-        row: dict[str, Any] = _counted(done[inside])
+    for place in np.argwhere(calls).tolist():
+        row = _counted(won[*place], calls[*place])
         for axis, edge, p in zip("xy", edges, place, strict=False):
             row |= {axis: float(edge[p]), f"{axis}2": float(edge[p + 1])}
         rows.append(row)
-    return rows, [[float(edge[0]), float(edge[-1])] for edge in edges]
+    return rows, ranges
 
 
-def _counted(done: Array) -> dict[str, Any]:
-    return {"share": float(done.mean()), "calls": len(done), "done": int(done.sum())}
+def _counted(done: Any, calls: Any) -> dict[str, Any]:
+    return {"share": float(done / calls), "calls": int(calls), "done": int(done)}
 
 
 def _edges(space: gym.spaces.Box, values: Array, i: int, count: int) -> Array:

@@ -10,7 +10,6 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +28,8 @@ class Group:
     """A letter, for charts and tables."""
     name: str
     runs: list[RunDirectory]
-    settings: dict[str, Any]
+    settings: dict[str, str]
+    """In words."""
 
 
 def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
@@ -44,8 +44,10 @@ def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
     for run in runs:
         settings = facts.settings(run.manifest)
         key = json.dumps([run.manifest.recipe, settings], sort_keys=True, default=str)
-        new = Group(_letter(len(by_settings)), _base(run), [], settings)
-        group = by_settings.setdefault(key, new)
+        turn, at = divmod(len(by_settings), 26)  # A to Z, then A2, B2 and so on
+        letter = chr(ord("A") + at) + (str(turn + 1) if turn else "")
+        words = {k: facts.plain(v) for k, v in settings.items()}
+        group = by_settings.setdefault(key, Group(letter, _base(run), [], words))
         for other in group.runs:
             if other.manifest.seed == run.manifest.seed:
                 raise DeclarationError(
@@ -54,26 +56,23 @@ def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
                 )
         group.runs.append(run)
     groups = list(by_settings.values())
+    alike = {g.name: [other for other in groups if other.name == g.name] for g in groups}
     for group in groups:
-        base = _base(group.runs[0])
-        same = [g for g in groups if _base(g.runs[0]) == base]
-        distinct = [f"{k} {_value(group, k)}" for k in _distinguishing(same)]
-        group.name = ", ".join([base, *distinct])
+        names = _distinguishing(alike[group.name])
+        distinct = [f"{k} {group.settings.get(k, facts.NOTHING)}" for k in names]
+        group.name = ", ".join([group.name, *distinct])
     return groups
 
 
 def differences(groups: Sequence[Group]) -> list[tuple[str, list[str]]]:
     """Return the settings in which groups differ: the name, and the value of each group."""
-    names = list(dict.fromkeys(k for g in groups for k in g.settings))
-    table = [(k, [_value(g, k) for g in groups]) for k in names]
+    names = dict.fromkeys(k for g in groups for k in g.settings)
+    table = [(k, [g.settings.get(k, facts.NOTHING) for g in groups]) for k in names]
     return [(k, values) for k, values in table if len(set(values)) > 1]
 
 
-def _value(group: Group, name: str) -> str:
-    return facts.plain(group.settings[name]) if name in group.settings else "–"
-
-
 def _base(run: RunDirectory) -> str:
+    """Return the name of a run's recipe, or of its environment."""
     recipe = run.manifest.recipe
     name = Path(recipe).stem if recipe else run.manifest.env
     return f"{name}, plain agent" if recipe and run.manifest.hierarchy is None else name
@@ -81,24 +80,16 @@ def _base(run: RunDirectory) -> str:
 
 def _distinguishing(groups: Sequence[Group]) -> list[str]:
     """Return few settings that distinguish the groups; each separates them best."""
-    table = dict(differences(groups))
-    names_: list[str] = []
+    table, names, separate = dict(differences(groups)), list[str](), 1
 
-    def parts(names: Sequence[str]) -> int:
-        return len({tuple(table[k][i] for k in names) for i in range(len(groups))})
+    def parts(name: str) -> int:
+        """Return how many groups differ in the settings so far and this one."""
+        return len({tuple(table[k][i] for k in (*names, name)) for i in range(len(groups))})
 
-    while table and parts(names_) < len(groups):
-        best = max(table, key=lambda k: parts([*names_, k]))  # the first of those that part as well
-        if parts([*names_, best]) == parts(names_):
-            break
-        names_.append(best)
-    return names_
-
-
-def _letter(number: int) -> str:
-    """Return A to Z, then A2, B2 and so on."""
-    turn, at = divmod(number, 26)
-    return chr(ord("A") + at) + (str(turn + 1) if turn else "")
+    while table and parts(best := max(table, key=parts)) > separate:
+        separate = parts(best)
+        names.append(best)
+    return names
 
 
 # Values over seeds
@@ -111,29 +102,32 @@ GRID = 100  # points of a curve
 class OverSeeds:
     """Interquartile means over seeds, with 95 % bootstrap intervals; arrays (…)."""
 
+    seeds: int
     mean: Array
-    low: Array | None
-    """None: one seed alone has no interval."""
-    high: Array | None
+    low: Array
+    """Of one seed it is the mean, as is ``high``."""
+    high: Array
+
+    @property
+    def bounds(self) -> dict[str, float]:
+        """The ``low`` and the ``high`` of a single number; empty: one seed has no interval."""
+        return {"low": float(self.low), "high": float(self.high)} if self.seeds > 1 else {}
 
     def interval(self, say: Callable[[float], str]) -> str:
         """Return a single number's interval in words; empty: it has none."""
-        if self.low is None or self.high is None:
-            return ""
-        return facts.span((self.low, self.high), say)
+        return facts.span(self.bounds.values(), say)
 
 
 def over_seeds(values: Array | Sequence[float]) -> OverSeeds:
     """Compute interquartile means of values (seeds, …), and their intervals; always the same."""
     x = np.asarray(values, float)
-    n = len(x)
+    n, mean = len(x), interquartile_means(x)
     if n < 2:
-        return OverSeeds(interquartile_means(x), None, None)
+        return OverSeeds(n, mean, mean, mean)
     drawn = np.random.default_rng(0).integers(0, n, (n, RESAMPLES))
     # A resample is a column, so the first axis remains the seeds.
-    means = interquartile_means(x[drawn])
-    low, high = np.percentile(means, (2.5, 97.5), axis=0)
-    return OverSeeds(interquartile_means(x), low, high)
+    low, high = np.percentile(interquartile_means(x[drawn]), (2.5, 97.5), axis=0)
+    return OverSeeds(n, mean, low, high)
 
 
 def on_one_grid(curves: Sequence[Sequence[tuple[int, float]]]) -> tuple[Array, Array] | None:

@@ -6,72 +6,81 @@ import base64
 import functools
 import importlib
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from skillweave.errors import needs_extra
+from skillweave.errors import SkillweaveError, needs_extra
 from skillweave.reporting.report.facts import percent
 from skillweave.runs.files import write_bytes
 
 LOCAL = Path(__file__).parent / "templates"
 
 
-@dataclass(frozen=True)
-class Section:
-    """A part of a page."""
+@dataclass
+class Page:
+    """A page that is being made; each section puts its parts into it."""
 
-    context: dict[str, Any]
-    """What its words are made of, and its film."""
-    data: dict[str, Any]
-    """What its charts and film need, as plain JSON."""
-    missing: list[str]
+    context: dict[str, Any] = field(default_factory=dict)
+    """What its words are made of; ``film``: of episodes, and ``hand_film``: of calls of one skill
+    after another, if there are any."""
+    data: dict[str, Any] = field(default_factory=dict)
+    """What its charts and films need, as plain JSON without NaN."""
+    missing: list[str] = field(default_factory=list)
     """Sentences on what is not in it."""
+    began: float = field(default_factory=time.perf_counter)
 
+    @contextmanager
+    def without(self, what: str) -> Iterator[None]:
+        """Leave out what cannot be made in this block: the page says that there ``what``, and why.
 
-def write_page(
-    path: Path, template: str, context: dict[str, Any], data: dict[str, Any]
-) -> dict[str, Any]:
-    """Fill a template and write the page, whole or not at all.
+        Args:
+            what: "is no film", say.
+        """
+        try:
+            yield
+        except SkillweaveError as error:
+            self.missing.append(f"There {what}: {str(error).rstrip('.')}.")
 
-    Args:
-        template: a file in ``templates``.
-        context: what its words are made of; ``film``: of episodes, and ``hand_film``: of calls of
-            one skill after another, if there are any.
-        data: what its charts and timelines are made of, as plain JSON without NaN.
+    def write(self, path: Path, template: str) -> dict[str, Any]:
+        """Fill a template and write the page, whole or not at all.
 
-    Returns:
-        ``path`` and ``bytes``.
+        Args:
+            path: the file.
+            template: a file in ``templates``.
 
-    Raises:
-        RunError: it cannot be written.
-        MissingExtra: the extra 'report' is not installed.
-    """
-    jinja2 = need("jinja2")
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(LOCAL),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["percent"] = percent
-    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    parts = {
-        "style": (LOCAL / "style.css").read_text("utf-8"),
-        "script": (LOCAL / "page.js").read_text("utf-8"),
-        "library": library(),
-        "data": data,
-        "made": time.strftime("%Y-%m-%d %H:%M"),
-    }
-    films = {
-        name: film and base64.b64encode(film.data).decode()
-        for name in ("film", "hand_film")
-        for film in [context.get(name)]
-    }
-    text = environment.get_template(template).render(parts | context | films).encode()
-    write_bytes(path, text)
-    return {"path": str(path), "bytes": len(text)}
+        Returns:
+            ``path``, ``bytes``, and the ``seconds`` since the page was begun.
+
+        Raises:
+            RunError: it cannot be written.
+            MissingExtra: the extra 'report' is not installed.
+        """
+        jinja2 = need("jinja2")
+        environment = jinja2.Environment(
+            loader=jinja2.FileSystemLoader(LOCAL),
+            autoescape=True,
+            undefined=jinja2.StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        environment.filters["percent"] = percent
+        environment.filters["base64"] = lambda content: base64.b64encode(content).decode()
+        environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+        text = environment.get_template(template).render(
+            self.context,
+            missing=self.missing,
+            data=self.data,
+            style=(LOCAL / "style.css").read_text("utf-8"),
+            script=(LOCAL / "page.js").read_text("utf-8"),
+            library=library(),
+            made=time.strftime("%Y-%m-%d %H:%M"),
+        )
+        write_bytes(path, text.encode())
+        seconds = round(time.perf_counter() - self.began, 2)
+        return {"path": str(path), "bytes": len(text.encode()), "seconds": seconds}
 
 
 @functools.cache

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,8 +11,6 @@ from typing import Any
 from skillweave._internal.paths import AGENT
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.envs.make import EnvSpec
-from skillweave.envs.obs_names import ObsNames
-from skillweave.errors import SkillweaveError
 from skillweave.planning.columns import ENDS
 from skillweave.planning.handover import wilson
 from skillweave.planning.run_log import load_calls
@@ -29,13 +26,7 @@ from skillweave.reporting.report.calls import (
     rounded,
     seen,
 )
-from skillweave.reporting.report.curves import (
-    Curves,
-    metrics_of,
-    reached_steps,
-    read_curves,
-    thinned,
-)
+from skillweave.reporting.report.curves import metrics_of, reached_steps, read_curves, thinned
 from skillweave.reporting.report.facts import (
     WHY,
     WORDS,
@@ -47,10 +38,10 @@ from skillweave.reporting.report.facts import (
     transition_rows,
     transitions,
 )
-from skillweave.reporting.report.film import Film, episode_shot, make_film
+from skillweave.reporting.report.film import episode_shot, make_film
 from skillweave.reporting.report.goals import goal_pictures
-from skillweave.reporting.report.handover import handover_section
-from skillweave.reporting.report.page import Section, library, write_page
+from skillweave.reporting.report.handover import add_handover
+from skillweave.reporting.report.page import Page, library
 from skillweave.reporting.report.verdict import is_binary, no_verdict, solved, verdict
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
@@ -78,99 +69,8 @@ class Played:
     log: PlayedEpisodes
     colors: dict[str, RGB]
     """Of each of the log's labels."""
-    section: Section
     with_goals: dict[str, Skill]
     """The skills with goals, by path."""
-
-
-@global_generators(Seeds(0) / "report")
-def play_episodes(
-    policy: Policy,
-    spec: EnvSpec,
-    episodes: int,
-    filmed: int,
-    seed: int,
-    deterministic: bool,
-    num_envs: int | None,
-    quiet: bool = True,
-) -> Played:
-    """Play episodes with seeds that training never used, and film some of them."""
-    spaces = policy.observation_space, policy.action_space
-    calls = PlayedCalls(policy, spaces, own_rewards=True, inside=False)
-    with EpisodeProgress(episodes, quiet=quiet, name="report") as progress:
-
-        def watch(played: PlayedStep) -> None:
-            calls.add(played)
-            progress.watch(played)
-
-        score = evaluate(
-            policy,
-            spec,
-            episodes=episodes,
-            seed=seed,
-            deterministic=deterministic,
-            num_envs=num_envs,
-            watch=watch,
-        )
-    seeds = episode_seeds(seed, episodes)
-    log = PlayedEpisodes(calls, seeds)
-    film = None
-    missing = []
-    if filmed:
-        try:
-            chosen = chosen_episodes(log.episodes, filmed)
-            film = make_film(spec, {i: episode_shot(log.episodes[i]) for i in chosen}, quiet=quiet)
-        except SkillweaveError as error:
-            missing.append(f"There is no film: {_sentence(error)}")
-    wanted = [skill.color for skill in log.skills] or [None] * len(log.labels)
-    colors = {k: color_of(i, wanted[i]) for i, k in enumerate(log.labels)}
-    with_goals = {k: skill for k, skill in calls.skills().items() if skill.goal_space is not None}
-    section = _section(log, film, spec.observation_names(), colors, missing)
-    if with_goals:
-        pictures = goal_pictures(calls.logs(seeds), with_goals, "in the played episodes")
-        section.context["goals"] += pictures
-    return Played(score, log, colors, section, with_goals)
-
-
-def _section(
-    log: PlayedEpisodes,
-    film: Film | None,
-    named: ObsNames | None,
-    colors: Mapping[str, RGB],
-    missing: list[str],
-) -> Section:
-    """Return the words and data of episodes; ``missing`` gets what is not in them."""
-    if any(isinstance(skill, RecordedSkill) for skill in log.skills):
-        missing.append(
-            "Of the calls, neither the skills' own rewards nor their successes are known, as the "
-            "run was loaded without the code of its skills: --recipe FILE.py gives it."
-        )
-    if misfit := names_misfit(log.episodes[0].calls["start"][:1], named):
-        missing.append(misfit)
-    shown, left_out = episode_data(log, film, named)
-    missing += left_out
-    legend = [(k, hex_of(color), charts.ink_on(color)) for k, color in colors.items()]
-    labels, hues, inks = (list(column) for column in zip(*legend, strict=True))
-    context = {
-        "legend": legend,
-        "episodes": len(log.episodes),
-        "filmed": 0 if film is None else len(film.first),
-        "film": film,
-        "has_skills": log.labels != (AGENT,),
-        "goals": [],
-    }
-    data: dict[str, Any] = {"labels": labels, "colors": hues, "inks": inks, "episodes": shown}
-    data["judged"] = log.judged
-    data["seen"], _ = seen(log.episodes[0].calls[:1], named)
-    if film is not None:
-        data["film"] = {"fps": film.fps, "every": film.every}
-    if context["has_skills"]:
-        decisions = decision_data(log, named)
-        used = sorted({*decisions["calls"]["skill"]}) if decisions["rows"] else []
-        goals = any(decisions["calls"]["goal"])
-        spec = charts.choices([labels[i] for i in used], [hues[i] for i in used], goals=goals)
-        data["decisions"] = decisions | {"spec": spec}
-    return Section(context, data, missing)
 
 
 def write_report(
@@ -205,7 +105,7 @@ def write_report(
         RunError: the run is damaged, or the file cannot be written.
         MissingExtra: the extra 'report' is not installed.
     """
-    began = time.perf_counter()
+    page, played, log = Page(), None, None
     episodes = fitted(AtLeastOne, episodes, "episodes")
     seed = fitted(Count, seed, "seed")
     filmed = fitted(Count, filmed, "films")
@@ -213,51 +113,132 @@ def write_report(
     must_be_own(path.parent)
     all_curves = read_curves(run)
     reached = reached_steps(all_curves)
-    missing = facts.missing_stages(run, reached)
-    missing += [why_not] if why_not and run.finished else []
-    played, sections = None, []
+    page.missing += facts.missing_stages(run, reached)
+    page.missing += [why_not] if why_not and run.finished else []
+    page.context |= {"has_skills": False, "goals": []} | dict.fromkeys(NOT_THERE)
     if policy is not None and spec is not None:
-        try:
+        with page.without("are no episodes and no film"):
             played = play_episodes(
-                policy, spec, episodes, filmed, seed, deterministic, run.num_envs, quiet
+                page, policy, spec, episodes, filmed, seed, deterministic, run.num_envs, quiet
             )
-            missing += played.section.missing
-            sections.append(played.section)
-        except SkillweaveError as error:
-            missing.append(f"There are no episodes and no film: {_sentence(error)}")
     if not all_curves and run.manifest.stages:
-        missing.append("There are no learning curves: no metrics were written yet.")
+        page.missing.append("There are no learning curves: no metrics were written yet.")
     colors = _colors(run, played)
-    try:
+    with page.without("is no handover"):
         log = load_calls(run)
-    except SkillweaveError as error:
-        log = None
-        missing.append(f"There is no handover: {_sentence(error)}")
     if log is not None and len(log):
         with_goals = {} if played is None else played.with_goals
-        sections.append(handover_section(log, spec, colors, with_goals, filmed=filmed > 0))
-        missing += sections[-1].missing
-        if played is not None:
-            pictures = goal_pictures({"": log}, with_goals, "of the run’s log")
-            played.section.context["goals"] += pictures
-    data: dict[str, Any] = {"curves": _curves(all_curves, colors)}
-    data["why"] = {end: WHY[name] for end, name in ENDS.items()}
-    context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
-    context |= _lineages(run, data, colors)
-    context |= {"curves": [c.label for c in all_curves], "metrics": metrics_of(all_curves)}
-    context |= {"episodes": 0, "has_skills": False, "handover": None, "goals": []}
-    for section in sections:
-        context |= section.context
-        data |= section.data
-    data["charts"] = {f"goals-{i}": picture["spec"] for i, picture in enumerate(context["goals"])}
-    data["binary"] = context["binary"]
-    page = write_page(path, "report.html", context, data)
-    page |= {"seconds": round(time.perf_counter() - began, 2)}
-    return page | {"verdict": context["verdict"], "missing": missing}
+        add_handover(page, log, spec, colors, with_goals, filmed=filmed > 0)
+        page.context["goals"] += goal_pictures({"": log}, with_goals, "of the run’s log")
+    _add_words(page, run, reached)
+    _add_scores(page, run, played, seed, deterministic)
+    _add_lineages(page, run, colors)
+    pictures = enumerate(page.context["goals"])
+    usual = hex_of(color_of(1))
+    page.context["metrics"] = metrics_of(all_curves)
+    page.data |= {
+        "charts": {f"goals-{i}": picture["spec"] for i, picture in pictures},
+        "why": {end: WHY[name] for end, name in ENDS.items()},
+        "curves": [
+            {
+                "label": c.label,
+                "spec": charts.curve(c.label, colors.get(c.agent, usual)),
+                "points": {
+                    metric: [[x, rounded(y)] for x, y in thinned(points)]
+                    for metric, points in c.points.items()
+                },
+            }
+            for c in all_curves
+        ],
+    }
+    written = page.write(path, "report.html")
+    return written | {"verdict": page.context["verdict"], "missing": page.missing}
 
 
-def _sentence(error: SkillweaveError) -> str:
-    return f"{str(error).rstrip('.')}."
+NOT_THERE = ("episodes", "film", "handover", "hand_film", "score")
+"""Parts that not every report has."""
+
+
+@global_generators(Seeds(0) / "report")
+def play_episodes(
+    page: Page,
+    policy: Policy,
+    spec: EnvSpec,
+    episodes: int,
+    filmed: int,
+    seed: int,
+    deterministic: bool,
+    num_envs: int | None,
+    quiet: bool = True,
+) -> Played:
+    """Play episodes with seeds that training never used, film some, and put them into the page."""
+    spaces = policy.observation_space, policy.action_space
+    calls = PlayedCalls(policy, spaces, own_rewards=True, inside=False)
+    with EpisodeProgress(episodes, quiet=quiet, name="report") as progress:
+
+        def watch(played: PlayedStep) -> None:
+            calls.add(played)
+            progress.watch(played)
+
+        score = evaluate(
+            policy,
+            spec,
+            episodes=episodes,
+            seed=seed,
+            deterministic=deterministic,
+            num_envs=num_envs,
+            watch=watch,
+        )
+    seeds = episode_seeds(seed, episodes)
+    log = PlayedEpisodes(calls, seeds)
+    wanted = [skill.color for skill in log.skills] or [None] * len(log.labels)
+    colors = {k: color_of(i, wanted[i]) for i, k in enumerate(log.labels)}
+    with_goals = {k: skill for k, skill in calls.skills().items() if skill.goal_space is not None}
+    played = Played(score, log, colors, with_goals)
+    _add_episodes(page, played, spec, filmed, quiet)
+    page.context["goals"] = goal_pictures(calls.logs(seeds), with_goals, "in the played episodes")
+    return played
+
+
+def _add_episodes(page: Page, played: Played, spec: EnvSpec, filmed: int, quiet: bool) -> None:
+    """Put the calls of the episodes into the page, and a film of some of these."""
+    log, named, film = played.log, spec.observation_names(), None
+    if filmed:
+        with page.without("is no film"):
+            chosen = chosen_episodes(log.episodes, filmed)
+            film = make_film(spec, {i: episode_shot(log.episodes[i]) for i in chosen}, quiet=quiet)
+    if any(isinstance(skill, RecordedSkill) for skill in log.skills):
+        page.missing.append(
+            "Of the calls, neither the skills' own rewards nor their successes are known, as the "
+            "run was loaded without the code of its skills: --recipe FILE.py gives it."
+        )
+    if misfit := names_misfit(log.episodes[0].calls["start"][:1], named):
+        page.missing.append(misfit)
+    shown, left_out = episode_data(log, film, named)
+    page.missing += left_out
+    labels, hues = list(log.labels), [hex_of(color) for color in played.colors.values()]
+    page.context |= {
+        "episodes": len(log.episodes),
+        "filmed": 0 if film is None else len(film.first),
+        "film": film,
+        "has_skills": log.labels != (AGENT,),
+    }
+    page.data |= {
+        "labels": labels,
+        "colors": hues,
+        "inks": [charts.ink_on(color) for color in played.colors.values()],
+        "episodes": shown,
+        "judged": log.judged,
+        "seen": list(seen(log.episodes[0].calls[:1], named)),
+    }
+    if film is not None:
+        page.data["film"] = {"fps": film.fps, "every": film.every}
+    if page.context["has_skills"]:
+        decisions = decision_data(log, named)
+        used = sorted({*decisions["calls"]["skill"]}) if decisions["rows"] else []
+        goals = any(decisions["calls"]["goal"])
+        spec_ = charts.choices([labels[i] for i in used], [hues[i] for i in used], goals=goals)
+        page.data["decisions"] = decisions | {"spec": spec_}
 
 
 def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
@@ -271,66 +252,48 @@ def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
     return {name: hex_of(color) for name, color in colors.items()}
 
 
-def _curves(all_curves: Sequence[Curves], colors: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return the curves with their charts, as plain JSON."""
-    usual = hex_of(color_of(1))
-    return [
-        {
-            "spec": charts.curve(c.label, colors.get(c.agent, usual)),
-            "points": {
-                metric: [[x, rounded(y)] for x, y in thinned(points)]
-                for metric, points in c.points.items()
-            },
-        }
-        for c in all_curves
-    ]
-
-
-def _words(run: RunDirectory, missing: list[str], reached: Mapping[str, int]) -> dict[str, Any]:
+def _add_words(page: Page, run: RunDirectory, reached: Mapping[str, int]) -> None:
+    """Put facts, stages and settings of the training into the page."""
     manifest = run.manifest
-    return {
+    page.context |= {
         "title": facts.name_of(run),
         "kind": "plain agent" if manifest.hierarchy is None else "hierarchy",
-        "env": manifest.env,
         "facts": facts.facts(run),
         "stages": facts.stage_rows(run, reached),
         "settings": [(k, facts.plain(v)) for k, v in facts.settings(manifest).items()],
-        "versions": list(manifest.versions.items()),
         "steps": sum(
             reached.get(entry.name, 0) if entry.steps is None else entry.steps
             for entry in manifest.stages
         ),
         "training_seconds": sum(entry.seconds or 0.0 for entry in manifest.stages),
-        "missing": missing,
-        "finished": run.finished,
+        "run": run,
     }
 
 
-def _scores(
-    run: RunDirectory, played: Played | None, seed: int, deterministic: bool
-) -> dict[str, Any]:
-    """Return the score and the skills' table, of the saved evaluation or the report's episodes."""
-    source = "of the run's evaluation"
+def _add_scores(
+    page: Page, run: RunDirectory, played: Played | None, seed: int, deterministic: bool
+) -> None:
+    """Put the score and the skills' table into the page.
+
+    They are of the saved evaluation, or of the report's episodes if these are as many.
+    """
+    source, docs = "of the run's evaluation", dict[str, str]()
     saved = load_evaluation(run, deterministic=deterministic)
     if played is not None:
-        own = SavedEvaluation("", seed, deterministic, played.score)
+        docs = dict(zip(played.log.labels, map(about, played.log.skills), strict=False))
         if saved is None or len(saved.evaluation.returns) <= len(played.score.returns):
-            saved, source = own, "played for this report"
+            saved = SavedEvaluation("", seed, deterministic, played.score)
+            source = "played for this report"
+    page.data["binary"] = saved is not None and is_binary(saved.evaluation.returns)
     if saved is None:
-        nothing: dict[str, Any] = dict.fromkeys(("skill_table", "reflexes", "transitions"), ())
-        text = no_verdict(run.manifest.stages)
-        return nothing | {"verdict": text, "binary": False, "score": None}
+        page.context |= dict.fromkeys(("skill_table", "reflexes", "transitions"), ())
+        page.context["verdict"] = no_verdict(run.manifest.stages)
+        return
     score = saved.evaluation
-    docs = (
-        {}
-        if played is None
-        else dict(zip(played.log.labels, map(about, played.log.skills), strict=False))
-    )
     how = "greedy" if saved.deterministic else "sampled"
     of = f"{len(score.returns)} episodes {source} ({how}, seed {saved.seed})"
-    return {
+    page.context |= {
         "verdict": verdict(score, deterministic),
-        "binary": is_binary(score.returns),
         "score": score_words(score) | {"of": of},
         "skill_table": [
             row | {"about": docs.get(row["name"], "")} for row in skill_rows(score.skills, WORDS)
@@ -346,12 +309,11 @@ def _scores(
 
 def score_words(score: Evaluation) -> dict[str, Any]:
     """Return the score as texts; digits fit the scale of the returns."""
-    score_json = score.to_json()
+    score_json, n, count = score.to_json(), len(score.returns), solved(score)
     say = partial(number, scale=scale_of(score.returns))
-    count = solved(score)
-    words: dict[str, Any] = {
+    return {
         "mean": say(score.mean),
-        "interval": None if len(score.returns) == 1 else span(score_json["ci95"], say),
+        "interval": None if n == 1 else span(score_json["ci95"], say),
         "iqm": say(score_json["iqm"]),
         "range": span((min(score.returns), max(score.returns)), say),
         "reached": percent(score.solved_fraction),
@@ -359,32 +321,26 @@ def score_words(score: Evaluation) -> dict[str, Any]:
         "length": number(score_json["length_mean"], max(score_json["length_mean"], 10)),
         "cut": score.cut,
         "binary": is_binary(score.returns),
-        "solved": None,
+        "solved": None if count is None else percent(count / n),
+        "solved_interval": None if count is None else span(wilson(count, n)),
     }
-    if count is None:
-        return words
-    interval = span(wilson(count, len(score.returns)))
-    return words | {"solved": percent(count / len(score.returns)), "solved_interval": interval}
 
 
-def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]) -> dict[str, Any]:
-    """Return a section for each stage whose population evolved."""
-    sections = []
-    data["trees"] = []
+def _add_lineages(page: Page, run: RunDirectory, colors: Mapping[str, str]) -> None:
+    """Put a section into the page for each stage whose population evolved."""
+    page.context["lineages"], page.data["trees"] = [], []
     for entry in run.manifest.stages:
         lineage = read_lineage(run, entry.name)
         if lineage is None:
             continue
-        color = colors[entry.name]
-        paths = charts.setting_paths(lineage, color)
-        data["trees"].append(
-            {"tree": charts.family_tree(lineage, color), "paths": [spec for _, spec in paths]}
-        )
+        color, winner = colors[entry.name], lineage.winner
+        tree = charts.family_tree(lineage, color)
+        paths = [charts.setting_path(name, lineage, color) for name in lineage.varied]
+        page.data["trees"].append({"tree": tree, "paths": paths})
         scale = scale_of(b.fitness for b in lineage.born.values())
         line = [
             (b.generation + 1, b.member, charts.what_changed(b), number(b.fitness, scale))
-            for b in lineage.path(lineage.winner)
+            for b in lineage.path(winner)
         ]
-        names = [(setting_title(k), short_value(lineage.winner.settings[k])) for k, _ in paths]
-        sections.append({"stage": entry.name, "line": line, "settings": names})
-    return {"lineages": sections}
+        names = [(setting_title(k), short_value(winner.settings[k])) for k in lineage.varied]
+        page.context["lineages"].append({"stage": entry.name, "line": line, "settings": names})
