@@ -55,8 +55,7 @@ class MultiStepReplayBuffer:
         if self._store is None:
             kind: Any = before.dtype if before.dtype.kind in "iu" else np.float32
             space: gym.Space[Any] = gym.spaces.Box(0, 1, before.shape[1:], kind)
-            size, shape = self.memory_size, action.shape[1:]
-            self._store = ReplayStore(size, n, 1, space, shape, action.dtype, **self._how)
+            self._store = ReplayStore(self.memory_size, n, 1, space, action[:1], **self._how)
         elif not np.array_equal(before, self._after):
             self._store.cut(np.arange(n))
         self._after = after
