@@ -20,7 +20,7 @@ from skillweave import DQN, PPO, RNN, Agent, EnvSpec, Network, Ray, SkillweaveEr
 from skillweave._internal.seeding import Seeds
 from skillweave.errors import DeclarationError
 from skillweave.evolution import Evolution, Mutations
-from skillweave.evolution.fitness import FitnessEnvs
+from skillweave.evolution.part import FitnessEnvs
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.training.learning_task import skill_task

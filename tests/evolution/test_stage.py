@@ -38,8 +38,7 @@ from skillweave.evolution import (
     Truncation,
     stage as evolving,
 )
-from skillweave.evolution.fitness import FitnessEnvs
-from skillweave.evolution.part import Part, has_diverged
+from skillweave.evolution.part import FitnessEnvs, Part, has_diverged
 from skillweave.evolution.population import Population
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors, write_tensors
