@@ -6,9 +6,8 @@ A change is drawn for the settings' networks (``network`` and, if it has one, ``
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,8 +30,6 @@ from skillweave.ops.device import FLOAT
 
 Alter = Callable[[Views, bool], dict[str, Tensor]]
 """A function from parameters by name, and whether they are moments, to changed parameters."""
-Plan = Callable[[Views], Alter]
-"""A function from the learning parameters by name to the change of these and their copies."""
 
 
 @dataclass(frozen=True)
@@ -50,22 +47,22 @@ def check_architecture(config: AlgorithmConfig, mutations: Mutations, where: str
         return
     for name, network in networks_of(config).items():
         if isinstance(network.encoder, Named):
-            raise DeclarationError(
-                f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has an "
-                f"encoder of your own ({network.encoder}), whose architecture is its code: set it "
-                "to 0"
+            has = (
+                f"an encoder of your own ({network.encoder}), whose architecture is its code: set "
+                "it to 0"
             )
-        if network.layer_norm:
-            raise DeclarationError(
-                f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has "
-                "layer_norm, with which no unit can be added without changing the function: set "
-                "it to 0, or layer_norm=False"
+        elif network.layer_norm:
+            has = (
+                "layer_norm, with which no unit can be added without changing the function: set it "
+                "to 0, or layer_norm=False"
             )
-        if not network.hidden:
-            raise DeclarationError(
-                f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has no "
-                "hidden layers to change: set it to 0, or give it some"
-            )
+        elif not network.hidden:
+            has = "no hidden layers to change: set it to 0, or give it some"
+        else:
+            continue
+        raise DeclarationError(
+            f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has {has}"
+        )
 
 
 def draw_change(member: Member, mutations: Mutations, spaces: Any, rng: Any) -> Change | None:
@@ -194,43 +191,49 @@ def _carried(
     flat = {**state, before.count: count}
     named = {k: before.layout.views(flat[k].reshape(-1, before.layout.size)) for k in names}
     for _, net in before.nets:
-        for plan in _plans(net, change, generator):
-            alter = plan(named[before.weights[0]])
+        for part in _parts_of(net, change):
+            online, activation = named[before.weights[0]], net.network.activation
+            alter = _altered(part, change.by, online, activation, generator)
             named = {k: alter(v, k not in before.weights) for k, v in named.items()}
     fields = {k: after.layout.flatten(v).reshape(*lead, -1) for k, v in named.items()}
     return fields | {before.count: even_count(fields[before.count].long())}
 
 
-def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:
-    """Return the changes of a network's parameters, one after another."""
+def _parts_of(net: Any, change: Change) -> Sequence[Units | Joint | str]:
+    """Return what changes in a network, one after another: units, the last layer, or filters."""
     if change.kind == "layer":
         joint = joint_of(net)
-        activation = net.network.activation
-        if change.by > 0:
-            return [lambda _: lambda v, m: deepened(v, joint, activation, moments=m)]
-        return [lambda _: lambda v, m: shallower(v, joint, moments=m)] * (joint.depth > 1)
+        return [joint] * (change.by > 0 or joint.depth > 1)
     if change.kind == "kernel":
         return [
-            functools.partial(_resized_kernel, f"{prefix}.{change.layer}.weight", change.by)
+            f"{prefix}.{change.layer}.weight"
             for prefix, encoder in net.encoders.items()
             if isinstance(encoder, ImageEncoder)
         ]
-    layer = min(change.layer, len(net.network.hidden) - 1)
-    groups = hidden_units(net, layer) if change.kind == "units" else channels_of(net, change.layer)
-    return [functools.partial(_resized, units, change.by, generator) for units in groups]
+    if change.kind == "channels":
+        return channels_of(net, change.layer)
+    return hidden_units(net, min(change.layer, len(net.network.hidden) - 1))
 
 
-def _resized(units: Units, by: int, generator: torch.Generator, online: Views) -> Alter:
-    """Return a change of the number of units, the same for all parameters of a family."""
+def _altered(
+    part: Units | Joint | str,
+    by: int,
+    online: Views,
+    activation: Activation,
+    generator: torch.Generator,
+) -> Alter:
+    """Return the change of a part, the same for all parameters of a family."""
+    if isinstance(part, str):
+        return lambda v, moments: with_kernel(v, part, by)
+    if isinstance(part, Joint):
+        if by > 0:
+            return lambda v, moments: deepened(v, part, activation, moments=moments)
+        return lambda v, moments: shallower(v, part, moments=moments)
     if by > 0:
-        new = fresh(online, units, by, generator)
-        return lambda v, moments: widened(v, units, by, None if moments else new)
-    units_to_keep = most_read(online, units, max(1, units.count + by))
-    return lambda v, moments: narrowed(v, units, units_to_keep)
-
-
-def _resized_kernel(name: str, by: int, online: Views) -> Alter:
-    return lambda v, moments: with_kernel(v, name, by)
+        new = fresh(online, part, by, generator)
+        return lambda v, moments: widened(v, part, by, None if moments else new)
+    units_to_keep = most_read(online, part, max(1, part.count + by))
+    return lambda v, moments: narrowed(v, part, units_to_keep)
 
 
 IDENTITY: tuple[Activation, ...] = ("relu", "elu", "silu", "gelu")

@@ -17,10 +17,9 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.buffers.replay import ReplayStore
 from skillweave.envs.joined import JoinedEngines
 from skillweave.errors import EnvError, SkillweaveError
-from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.stacks import Member, grouped, join, split
 from skillweave.experience.acting import Acting
-from skillweave.experience.collector import Collector, joined_from, parted
+from skillweave.experience.collector import RETURN, Collector, joined_from, parted
 from skillweave.experience.group import Collectors
 from skillweave.experience.learners import Calling
 from skillweave.ops.device import resolve_device
@@ -29,6 +28,7 @@ from skillweave.training.episodes import Episodes, EpisodeTally, Tick
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Loop, Progress
+from skillweave.training.periodic import episodes_of
 from skillweave.training.replay_learner import ReplayLearner, check_counts, store_of
 from skillweave.types import Array, prefixed, unprefixed
 
@@ -243,3 +243,39 @@ def policy_of(member: Member, spaces: tuple[Any, Any]) -> AgentPolicy:
 def has_diverged(member: Member) -> bool:
     """Return whether a learnt number is not finite."""
     return not all(bool(torch.isfinite(v).all()) for v in vars(member.state).values())
+
+
+class FitnessEnvs:
+    """Environments in which one member after another plays the same episodes.
+
+    They are at most as many as in a member's training: more episodes are played in several rounds.
+
+    Args:
+        learning_task: the task that members learn.
+        episodes: the number of episodes of each member.
+        num_envs: environments of a member's training.
+    """
+
+    def __init__(self, learning_task: LearningTask, episodes: int, num_envs: int) -> None:
+        rounds = -(-episodes // num_envs)
+        self._episodes, self._who = episodes, learning_task.who
+        self._engine = learning_task.engine(-(-episodes // rounds))
+
+    @property
+    def steps_made(self) -> int:
+        """Return the number of steps of all members in these environments."""
+        return self._engine.steps_made
+
+    def score(self, policy: AgentPolicy, seeds: Seeds) -> float:
+        """Return a policy's mean return of the episodes of these seeds; −inf if not finite."""
+        total, each = self._episodes, self._engine.num_envs
+        played = [
+            episodes_of(policy, self._who, self._engine, seeds, first, min(each, total - first))
+            for first in range(0, total, each)
+        ]
+        returns = np.concatenate(played)[:, RETURN]
+        return float(returns.mean()) if np.isfinite(returns).all() else -np.inf
+
+    def close(self) -> None:
+        """Release the environments."""
+        self._engine.close()

@@ -12,9 +12,8 @@ import numpy as np
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.evolution.config import Evolution
-from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.mutation import mutate, random_config
-from skillweave.evolution.part import OnGenerationTick, Part
+from skillweave.evolution.part import FitnessEnvs, OnGenerationTick, Part
 from skillweave.evolution.selection import select
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member, copy, grouped

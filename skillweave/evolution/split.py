@@ -19,8 +19,7 @@ from torch import Tensor
 from skillweave._internal.seeding import Seeds, seed_global_generators
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.evolution.fitness import FitnessEnvs
-from skillweave.evolution.part import OnGenerationTick, Part
+from skillweave.evolution.part import FitnessEnvs, OnGenerationTick, Part
 from skillweave.evolution.stacks import Member
 from skillweave.experience.group import joined_states, split_states
 from skillweave.training.episodes import EpisodeTally

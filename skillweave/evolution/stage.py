@@ -21,8 +21,7 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json, conf
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
 from skillweave.errors import RunError
 from skillweave.evolution.config import Evolution, evolution_from_json
-from skillweave.evolution.fitness import FitnessEnvs
-from skillweave.evolution.part import policy_of
+from skillweave.evolution.part import FitnessEnvs, policy_of
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member

@@ -14,13 +14,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from small_runs import assert_metrics_fit, interrupt_at_checkpoint
+from small_runs import interrupt_at_checkpoint
+from test_stage import assert_same_population
 
 from skillweave import DQN, PPO, RNN, Agent, EnvSpec, Network, Ray, SkillweaveError
 from skillweave._internal.seeding import Seeds
 from skillweave.errors import DeclarationError
 from skillweave.evolution import Evolution, Mutations
-from skillweave.evolution.fitness import FitnessEnvs
+from skillweave.evolution.part import FitnessEnvs
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.training.learning_task import skill_task
@@ -80,14 +81,6 @@ def agent(workers: int | None = 2, fatal: Path | None = None, config: Any = SMAL
     return Agent(spec, config, 240)
 
 
-def assert_same(run: Path, reference: Path) -> None:
-    """The same members in all generations, weights and metrics."""
-    assert (run / "lineage.jsonl").read_text() == (reference / "lineage.jsonl").read_text()
-    policies = [(p / "policies" / "agent.safetensors").read_bytes() for p in (run, reference)]
-    assert policies[0] == policies[1]
-    assert_metrics_fit(run, reference)
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A population in two parts, trained in this thread."""
@@ -104,7 +97,7 @@ def test_parts_in_processes_find_the_same_though_one_is_killed(whole, tmp_path):
     fatal.touch()
     run = agent(fatal=fatal).train(tmp_path / "run", quiet=True, evolve=EVOLVE)
     assert not fatal.exists(), "nobody was killed"
-    assert_same(run.path, whole)
+    assert_same_population(run.path, whole)
     (entry,) = run.info()["stages"]
     assert entry["workers"] == 2
     ticks = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
@@ -119,7 +112,7 @@ def test_a_split_population_goes_on_from_its_last_generation(whole, tmp_path, mo
         agent().train(tmp_path / "run", quiet=True, evolve=EVOLVE)
     monkeypatch.undo()
     agent(workers=None).resume(tmp_path / "run", quiet=True)  # the run keeps their number
-    assert_same(tmp_path / "run", whole)
+    assert_same_population(tmp_path / "run", whole)
 
 
 @pytest.mark.fast_cases(1)
@@ -226,7 +219,7 @@ def test_a_run_goes_on_on_ray_and_ends_the_same_though_an_actor_is_killed(
         agent(None, fatal).resume(tmp_path / "run", cluster=Ray(patience=60.0))
         assert "died; it is made again" in capsys.readouterr().err
         assert not fatal.exists(), "nobody was killed"
-        assert_same(tmp_path / "run", whole)
+        assert_same_population(tmp_path / "run", whole)
 
         agent(None).train(tmp_path / "alone", evolve=Evolution(2, 1, 1), cluster=Ray())
         assert "agent: the population trains in this process" in capsys.readouterr().err

@@ -14,8 +14,10 @@ from small_runs import OFF, ON, Balance, Left, Push, assert_same, lines
 
 import skillweave as sw
 from skillweave import Agent, Apart, EnvSpec, Hierarchy, SkillweaveError
+from skillweave.cli.execute import run_lines
 from skillweave.errors import DeclarationError, Interrupted
 from skillweave.evolution import Evolution
+from skillweave.reporting.report.facts import stage_rows
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import TrainEvent
 
@@ -52,7 +54,8 @@ def test_a_callback_gets_each_report_and_each_checkpoint_as_the_run_has_them(
     tmp_path: Path,
 ) -> None:
     events: list[TrainEvent] = []
-    agent().train(tmp_path / "run", quiet=True, callback=events.append, **EVALUATED)
+    how = EVALUATED | {"callback": events.append, "quiet": True}
+    sw.train_agent(SYNC, ON, 640, tmp_path / "run", **how)
     reports = [e for e in events if e.kind == "report"]
     checkpoints = [e for e in events if e.kind == "checkpoint"]
     assert len(reports) + len(checkpoints) == len(events)
@@ -102,31 +105,35 @@ def stops_at(steps: int, answer: Any = False, kind: str = "report") -> Callable[
     return lambda event: answer if event.steps >= steps and event.kind == kind else None
 
 
-@pytest.mark.parametrize("answer", [False, np.bool_(False)], ids=["False", "numpy's"])
-def test_false_ends_a_plain_agent_with_what_it_has_learnt(answer: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("answer", "kind"),
+    [(False, "report"), (np.bool_(False), "report"), (False, "checkpoint")],
+    ids=["False", "numpy's", "at a checkpoint"],
+)
+def test_false_ends_a_plain_agent_with_what_it_has_learnt(
+    answer: Any, kind: str, tmp_path: Path
+) -> None:
     path = tmp_path / "run"
-    run = agent().train(path, quiet=True, callback=stops_at(300, answer))
+    how = EVALUATED | {"callback": stops_at(300, answer, kind), "quiet": True}
+    run = agent().train(path, **how)
     (entry,) = run.info()["stages"]
     assert entry["status"] == "done"
     assert 300 <= entry["stopped"]["steps"] == entry["steps"] < 400
-    assert lines(path)[-1]["steps"] == 320
+    # A checkpoint comes before the report of the update that is still made.
+    assert lines(path)[-1]["steps"] == (288 if kind == "checkpoint" else 320)
     assert len(run.evaluate(2).returns) == 2
     assert not list(path.glob("checkpoint*"))
     again = agent().resume(path, quiet=True, callback=never)
     assert again.info()["stages"] == run.info()["stages"]
+    told = RunDirectory.open(path)
+    assert any("a callback ended it after" in text for text in run_lines(told.manifest, [], "run"))
+    assert "a callback ended it after" in stage_rows(told, {})[0]["notes"]
 
 
 def test_none_and_other_values_do_not_stop(tmp_path: Path) -> None:
     for i, answer in enumerate((None, 0, True, "")):
         run = agent(160).train(tmp_path / str(i), quiet=True, callback=stops_at(0, answer))
         assert "stopped" not in run.info()["stages"][0]
-
-
-def test_false_at_a_checkpoint_ends_the_stage_too(tmp_path: Path) -> None:
-    run = agent().train(
-        tmp_path / "run", quiet=True, callback=stops_at(300, kind="checkpoint"), **EVALUATED
-    )
-    assert 300 <= run.info()["stages"][0]["steps"] < 400
 
 
 def test_false_ends_one_stage_and_the_next_one_starts(tmp_path: Path) -> None:
@@ -155,18 +162,13 @@ def test_false_while_all_learn_together_ends_the_run_judged(tmp_path: Path) -> N
     assert len(run.evaluate(2).returns) == 2
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_false_ends_a_population_after_its_generation(workers: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("workers", "kind"), [(1, "report"), (2, "report"), (1, "checkpoint")])
+def test_false_ends_a_population_after_its_generation(
+    workers: int, kind: str, tmp_path: Path
+) -> None:
     env = EnvSpec("CartPole-v1", engine="sync", workers=workers)
-    seen: list[int] = []
-
-    def stop(event: TrainEvent) -> bool:
-        seen.append(event.steps)
-        return event.steps < 700
-
-    run = Agent(env, ON, 2_000).train(
-        tmp_path / "run", quiet=True, evolve=Evolution(2, 4, 2), callback=stop
-    )
+    how: dict[str, Any] = {"evolve": Evolution(2, 4, 2), "callback": stops_at(700, kind=kind)}
+    run = Agent(env, ON, 2_000).train(tmp_path / "run", quiet=True, **how)
     (entry,) = run.info()["stages"]
     assert entry["status"] == "done"
     assert 700 <= entry["stopped"]["steps"] == entry["steps"]
@@ -174,18 +176,6 @@ def test_false_ends_a_population_after_its_generation(workers: int, tmp_path: Pa
     generations = {line.generation for line in RunDirectory.open(tmp_path / "run").lineage.read()}
     assert len(generations) == entry["winner"]["generations"], "no generation is left half done"
     assert len(run.evaluate(2).returns) == 2
-
-
-def test_false_at_a_populations_checkpoint(tmp_path: Path) -> None:
-    run = Agent(SYNC, ON, 2_000).train(
-        tmp_path / "run",
-        quiet=True,
-        evolve=Evolution(2, 4, 2),
-        callback=stops_at(700, kind="checkpoint"),
-    )
-    (entry,) = run.info()["stages"]
-    assert entry["stopped"]["steps"] == entry["steps"] >= 700
-    assert entry["winner"]["generations"] < 4
 
 
 @pytest.mark.parametrize("error", [TrialPruned(), ValueError("no"), SkillweaveError("mine")])
@@ -269,12 +259,6 @@ def test_a_callback_prunes_trials_as_the_page_shows(tmp_path: Path) -> None:
     assert states == [("COMPLETE", [224, 416, 608]), ("PRUNED", [224])]
 
 
-def test_train_agent_takes_one(tmp_path: Path) -> None:
-    events: list[TrainEvent] = []
-    sw.train_agent(SYNC, ON, 160, tmp_path / "run", quiet=True, callback=events.append)
-    assert events
-
-
 class Wanders:
     """As Stable-Baselines3's callbacks: an object that cannot be called."""
 
@@ -314,13 +298,3 @@ def test_functions_written_in_c_and_partial_ones_are_callbacks(tmp_path: Path) -
     agent(64).train(tmp_path / "a", quiet=True, callback=lambda e, seen=events: seen.update({1: e}))
     agent(64).train(tmp_path / "b", quiet=True, callback=print)
     assert events
-
-
-def test_a_run_says_that_a_callback_ended_it(tmp_path: Path) -> None:
-    from skillweave.cli.execute import run_lines
-    from skillweave.reporting.report.facts import stage_rows
-
-    agent().train(tmp_path / "run", quiet=True, callback=stops_at(300))
-    run = RunDirectory.open(tmp_path / "run")
-    assert any("a callback ended it after" in text for text in run_lines(run.manifest, [], "run"))
-    assert "a callback ended it after" in stage_rows(run, {})[0]["notes"]

@@ -246,13 +246,6 @@ def test_steps_and_calls_of_each_skill_are_counted_exactly(num_envs):
     assert "short 50%, long 50%, never 0%" in str(found)
 
 
-def test_a_plain_policy_has_no_skills_to_count():
-    found = evaluate(fixed(1), EnvSpec(Line), episodes=3)
-    assert found.skill_steps == found.skill_calls == {}
-    assert found.to_json()["skill_usage"] == {}
-    assert "skills" not in str(found)
-
-
 @pytest.mark.parametrize("num_envs", [1, 2, 3])
 def test_a_policy_is_shown_true_transitions_and_the_time_in_each_episode(num_envs):
     seen = []

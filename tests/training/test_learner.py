@@ -9,15 +9,11 @@ import numpy as np
 import pytest
 import torch
 from toys import (
-    BoxIdentity,
-    Broken,
     Calls,
     Countdown,
-    Cut,
     Echo,
     Identity,
     Steady,
-    goes_on,
     learn,
     training,
 )
@@ -234,29 +230,6 @@ def test_where_environments_begin_anew_trajectories_and_returns_end():
 # Going on
 
 
-FEW = {"tau": 0.05, "learning_rate": 1e-3}
-KINDS = {
-    "dqn": (DQN(**SETTINGS, **FEW), Identity),
-    "rainbow": (DQN.rainbow(**SETTINGS, **FEW), Identity),
-    "td3": (TD3(**SETTINGS, **FEW, normalize_obs=True), BoxIdentity),
-    "sac": (SAC(**SETTINGS, **FEW, normalize_rewards=True), BoxIdentity),
-    "sac of choices": (SAC(**SETTINGS, **FEW, n_step=2), Identity),
-    "a selector": (DQN(**SETTINGS, **FEW, normalize_rewards=True, update_ratio=0.7), Calls),
-}
-
-
-@pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", KINDS)
-def test_a_run_resumed_at_a_checkpoint_ends_with_the_very_same_weights(name):
-    config, kind = KINDS[name]
-    algorithm = make_algorithm(config, kind.observation_space, kind.action_space)
-    whole, saved, resumed = goes_on(algorithm, lambda: kind(4), 500, 120)
-    assert (saved.at.update, saved.at.steps) == (60 // kind.row_steps, 240)
-    # The store is part of it:
-    without = {k: v for k, v in saved.extra.items() if not k.startswith("learner.store.")}
-    assert not torch.equal(resumed(without).state.params, whole.state.params)
-
-
 def test_a_resumed_run_without_its_store_fills_it_by_what_it_has_learnt():
     env = Identity(4)
     spy = Spy(replace(CONFIG, save_buffer=False), env.observation_space, env.action_space)
@@ -318,24 +291,7 @@ def test_members_have_scales_of_their_own_by_their_own_discounts():
     assert found.state.return_mean.flatten().tolist() == pytest.approx(means, rel=1e-4)
 
 
-# Stopping, and what cannot be
-
-
-def test_learning_that_diverges_is_an_error_that_says_what_where_and_when():
-    with pytest.raises(SkillweaveError, match=r"of member 0 is nan at update 25.*has diverged"):
-        learn(CONFIG, Broken(4), 100, on_tick=lambda tick: None)
-
-
-def test_the_callback_may_stop_the_run_and_threads_are_given_back():
-    torch.set_num_threads(1)
-
-    def stop(tick: Tick) -> None:
-        assert torch.get_num_threads() == 2
-        raise Cut
-
-    with pytest.raises(Cut):
-        learn(replace(CONFIG, threads=2), Identity(4), 80, on_tick=stop)
-    assert torch.get_num_threads() == 1
+# What cannot be
 
 
 def test_a_store_that_does_not_fit_into_memory_is_refused_before_training():

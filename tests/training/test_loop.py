@@ -27,7 +27,7 @@ from toys import (
 )
 
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.config import DQN, PPO
+from skillweave.algorithms.config import DQN, PPO, SAC, TD3
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.envs.make import EnvSpec, make_engine
@@ -408,22 +408,38 @@ def test_what_a_lost_worker_did_not_repeat_is_cut_before_rows_of_it_are_kept():
 # Checkpoints
 
 
+FEW = {
+    "num_envs": 4, "batch_size": 8, "learning_starts": 40, "buffer_size": 400, "gamma": 0.9,
+    "network": Network((8,)), "tau": 0.05, "learning_rate": 1e-3,
+}  # fmt: skip
 CUTS = {
     "ppo": (CONFIG, Identity),
     "ppo without overlap": (replace(CONFIG, overlap=False), Identity),
     "recurrent ppo": (RECURRENT, Recall),
     "a selector": (CONFIG, Calls),
     "a recurrent selector": (RECURRENT, Calls),
+    "dqn": (DQN(**FEW), Identity),
+    "rainbow": (DQN.rainbow(**FEW), Identity),
+    "td3": (TD3(**FEW, normalize_obs=True), BoxIdentity),
+    "sac": (SAC(**FEW, normalize_rewards=True), BoxIdentity),
+    "sac of choices": (SAC(**FEW, n_step=2), Identity),
+    "a selector from replay": (DQN(**FEW, normalize_rewards=True, update_ratio=0.7), Calls),
 }
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", CUTS)
 def test_a_run_resumed_at_a_checkpoint_ends_with_the_very_same_weights_and_metrics(name):
-    config, env = CUTS[name]
-    algorithm, rollout = PPOAlgorithm(config, env.observation_space, env.action_space), 256
-    _, saved, _ = goes_on(algorithm, lambda: env(16), 10 * rollout, 3 * rollout)
-    assert (saved.at.update, saved.at.steps) == (6, 6 * rollout)
+    config, kind = CUTS[name]
+    algorithm = make_algorithm(config, kind.observation_space, kind.action_space)
+    rows = config.n_steps if isinstance(config, PPO) else kind.row_steps
+    n, rollout = config.num_envs, rows * config.num_envs
+    every = 3 * rollout if isinstance(config, PPO) else 120
+    whole, saved, resumed = goes_on(algorithm, lambda: kind(n), 4 * every + 20, every)
+    assert (saved.at.update, saved.at.steps) == (2 * every // rollout, 2 * every)
+    if not isinstance(config, PPO):  # the store is part of it
+        without = {k: v for k, v in saved.extra.items() if not k.startswith("learner.store.")}
+        assert not torch.equal(resumed(without).state.params, whole.state.params)
 
 
 def test_reported_returns_and_lengths_are_those_of_whole_episodes():
@@ -457,12 +473,13 @@ def test_a_checkpoint_of_other_environments_is_refused():
 
 
 @pytest.mark.parametrize("on_tick", [None, lambda tick: None])
-@pytest.mark.parametrize("overlap", [True, False])
-def test_learning_that_diverges_is_an_error_that_says_what_where_and_when(on_tick, overlap):
-    with pytest.raises(
-        TrainingError, match=r"of member 0 is nan at update 1: training has diverged"
-    ):
-        train(Broken(16), 3, replace(CONFIG, overlap=overlap), on_tick=on_tick)
+@pytest.mark.parametrize(
+    ("config", "update"), [(CONFIG, 1), (replace(CONFIG, overlap=False), 1), (REPLAY, 63)]
+)
+def test_learning_that_diverges_is_an_error_that_says_what_where_and_when(config, update, on_tick):
+    says = rf"of member 0 is nan at update {update}: training has diverged"
+    with pytest.raises(TrainingError, match=says):
+        learn(config, Broken(16), 2_000, on_tick=on_tick)
 
 
 @pytest.mark.parametrize("config", [CONFIG, replace(CONFIG, overlap=False), REPLAY])
@@ -497,13 +514,14 @@ def test_a_member_that_diverges_may_be_skipped(config):
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("overlap", [True, False])
-def test_the_callback_may_stop_the_run_and_threads_are_given_back(overlap):
+@pytest.mark.parametrize("config", [CONFIG, replace(CONFIG, overlap=False), REPLAY])
+def test_the_callback_may_stop_the_run_and_threads_are_given_back(config):
     torch.set_num_threads(1)
 
     def stop(tick: Tick) -> None:
+        assert torch.get_num_threads() == (1 if config.overlap else 2)
         raise Cut
 
     with pytest.raises(Cut):
-        train(Identity(16), 5, replace(CONFIG, threads=2, overlap=overlap), on_tick=stop)
+        learn(replace(config, threads=2), Identity(16), 2_000, on_tick=stop)
     assert torch.get_num_threads() == 1
