@@ -79,8 +79,7 @@ def report(name: str, result: dict[str, Any]) -> None:
     (folder / f"{name}.json").write_text(json.dumps(result, indent=2))
 
 
-def median(values: Iterable[float]) -> float:
-    return statistics.median(values)
+median = statistics.median
 
 
 class RecordedPool:

@@ -14,8 +14,8 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import as_path, short, suggest
 from skillweave.errors import DeclarationError, RunError, needs_extra
 from skillweave.reporting.report.curves import read_curves
+from skillweave.reporting.report.facts import is_binary
 from skillweave.reporting.report.groups import grouped, on_one_grid
-from skillweave.reporting.report.verdict import is_binary
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.several import open_runs

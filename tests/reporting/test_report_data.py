@@ -14,8 +14,8 @@ from reporting.walkway import CALLS, Moody, Walkway, declare, played, told
 from skillweave import EnvSpec, SkillweaveError
 from skillweave.cli import main
 from skillweave.errors import EnvError
-from skillweave.reporting.palette import hex_of
-from skillweave.reporting.report import calls, charts
+from skillweave.reporting.palette import hex_of, is_light
+from skillweave.reporting.report import calls
 from skillweave.reporting.report.charts import scores
 from skillweave.reporting.report.curves import read_curves, thinned
 from skillweave.reporting.report.facts import transition_rows, transitions
@@ -169,7 +169,7 @@ def test_thinned_keeps_the_last_point():
 
 
 def test_a_word_on_a_colour_is_black_or_white():
-    assert (charts.ink_on((255, 255, 255)), charts.ink_on((0, 0, 60))) == ("#000", "#fff")
+    assert (is_light((255, 255, 255)), is_light((0, 0, 60))) == (True, False)
     assert hex_of((1, 255, 16)) == "#01ff10"
 
 

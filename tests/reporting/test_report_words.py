@@ -16,9 +16,8 @@ from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
 from skillweave.errors import DeclarationError
 from skillweave.reporting.report import calls
 from skillweave.reporting.report.compare import write_comparison
-from skillweave.reporting.report.facts import about, number, percent
+from skillweave.reporting.report.facts import about, no_verdict, number, percent, verdict
 from skillweave.reporting.report.single import score_words
-from skillweave.reporting.report.verdict import no_verdict, verdict
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from skillweave.reporting.lineage import Lineage, changes_words, number_of, setting_title
-from skillweave.reporting.palette import RGB, is_light
 from skillweave.runs.manifest import LineageLine
 
 Spec = dict[str, Any]
@@ -232,16 +231,8 @@ def setting_path(name: str, lineage: Lineage, color: str) -> Spec:
 
 def what_changed(born: LineageLine) -> str:
     """Return a member's mutation in words."""
-    if not born.changes:
-        return {"none": "nothing", "start": "–", "goes on": "goes on"}.get(
-            born.mutation, born.mutation
-        )
-    return changes_words(born)
-
-
-def ink_on(color: RGB) -> str:
-    """Return black or white, whichever is read better on a colour."""
-    return "#000" if is_light(color) else "#fff"
+    words = {"none": "nothing", "start": "–"}
+    return changes_words(born) or words.get(born.mutation, born.mutation)
 
 
 def scores(

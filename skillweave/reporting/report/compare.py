@@ -15,9 +15,11 @@ from skillweave.reporting.report.calls import rounded
 from skillweave.reporting.report.curves import Curves, metrics_of, read_curves
 from skillweave.reporting.report.facts import (
     NOTHING,
+    is_binary,
     number,
     percent,
     scale_of,
+    solved_share,
     transition_rows,
     transitions,
 )
@@ -29,7 +31,6 @@ from skillweave.reporting.report.groups import (
     over_seeds,
 )
 from skillweave.reporting.report.page import Page, library
-from skillweave.reporting.report.verdict import is_binary, solved_share
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation

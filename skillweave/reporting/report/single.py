@@ -15,7 +15,7 @@ from skillweave.planning.columns import ENDS
 from skillweave.planning.handover import wilson
 from skillweave.planning.run_log import load_calls
 from skillweave.reporting.lineage import read_lineage, setting_title, short_value
-from skillweave.reporting.palette import RGB, color_of, hex_of
+from skillweave.reporting.palette import RGB, color_of, hex_of, is_light
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report import charts, facts
 from skillweave.reporting.report.calls import (
@@ -31,18 +31,21 @@ from skillweave.reporting.report.facts import (
     WHY,
     WORDS,
     about,
+    is_binary,
+    no_verdict,
     number,
     percent,
     scale_of,
+    solved,
     span,
     transition_rows,
     transitions,
+    verdict,
 )
 from skillweave.reporting.report.film import episode_shot, make_film
 from skillweave.reporting.report.goals import goal_pictures
 from skillweave.reporting.report.handover import add_handover
 from skillweave.reporting.report.page import Page, library
-from skillweave.reporting.report.verdict import is_binary, no_verdict, solved, verdict
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.schema import AtLeastOne, Count, fitted
@@ -115,7 +118,8 @@ def write_report(
     reached = reached_steps(all_curves)
     page.missing += facts.missing_stages(run, reached)
     page.missing += [why_not] if why_not and run.finished else []
-    page.context |= {"has_skills": False, "goals": []} | dict.fromkeys(NOT_THERE)
+    absent = dict.fromkeys(("episodes", "film", "handover", "hand_film", "score"))
+    page.context |= absent | {"has_skills": False, "goals": []}
     if policy is not None and spec is not None:
         with page.without("are no episodes and no film"):
             played = play_episodes(
@@ -153,10 +157,6 @@ def write_report(
     }
     written = page.write(path, "report.html")
     return written | {"verdict": page.context["verdict"], "missing": page.missing}
-
-
-NOT_THERE = ("episodes", "film", "handover", "hand_film", "score")
-"""Parts that not every report has."""
 
 
 @global_generators(Seeds(0) / "report")
@@ -226,7 +226,7 @@ def _add_episodes(page: Page, played: Played, spec: EnvSpec, filmed: int, quiet:
     page.data |= {
         "labels": labels,
         "colors": hues,
-        "inks": [charts.ink_on(color) for color in played.colors.values()],
+        "inks": ["#000" if is_light(color) else "#fff" for color in played.colors.values()],
         "episodes": shown,
         "judged": log.judged,
         "seen": list(seen(log.episodes[0].calls[:1], named)),
