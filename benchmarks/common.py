@@ -18,12 +18,12 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from skillweave.cli.processes import processes
+from skillweave.cli.processes import Processes
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.errors import SkillweaveError
 from skillweave.types import Array
 
-workers = processes
+workers = Processes
 """A pool of fresh processes that end when this one does, however it ends."""
 
 

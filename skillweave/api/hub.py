@@ -26,7 +26,6 @@ def push_run(path: Path, name: str, private: bool = False, calls: bool = False) 
     hub.check_whole(run)
     if calls:
         needed_calls(run)
-    files: dict[str, Path | bytes] = {}
     run_files, stays = hub.run_files(run, calls)
     films = hub.run_films(run)
     missing = [f"{f} is no safetensors file: it stays" for f in stays]
@@ -42,8 +41,8 @@ def push_run(path: Path, name: str, private: bool = False, calls: bool = False) 
             missing.append(f"no figures: {error}")
         figures = {f"{hub.FIGURES}/{p.name}": p for p in drawn}
         shown = {"films": [p.name for p in films], "figures": list(figures)}
-        files["README.md"] = write_card(run, name, **shown).encode()
-        files |= run_files | {p.name: p for p in films} | figures
+        card = write_card(run, name, **shown).encode()
+        files = {"README.md": card, **run_files, **{p.name: p for p in films}, **figures}
         uploaded = hub.upload(name, files, private)
     return {**uploaded, "files": list(files), "missing": missing}
 

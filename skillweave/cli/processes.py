@@ -11,10 +11,9 @@ import os
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
-from typing import Any
+from typing import Any, Self
 
 from skillweave.errors import SkillweaveError, TrainingError, reworded
 
@@ -28,7 +27,7 @@ class ProcessEnded(TrainingError):
 
 
 class Processes:
-    """A pool that runs a number of jobs at once; see ``processes``."""
+    """A pool of fresh processes, ``count`` at once; an error in its block ends them all."""
 
     def __init__(self, count: int) -> None:
         self._threads = ThreadPoolExecutor(count)
@@ -75,29 +74,17 @@ class Processes:
             raise error
         return result
 
-    def end(self) -> None:
-        """End all jobs, and start no other."""
-        with self._lock:
-            self._over = True
-            for child in self._running:
-                child.terminate()
+    def __enter__(self) -> Self:
+        return self
 
-    def close(self) -> None:
-        """Wait for all jobs."""
+    def __exit__(self, error: object, *_: object) -> None:
+        """Wait for all jobs; after an error end them, and start no other."""
+        if error is not None:
+            with self._lock:
+                self._over = True
+                for child in self._running:
+                    child.terminate()
         self._threads.shutdown()
-
-
-@contextmanager
-def processes(count: int) -> Iterator[Processes]:
-    """Yield a pool of fresh processes, ``count`` at once; an error in the block ends them all."""
-    pool = Processes(count)
-    try:
-        yield pool
-    except BaseException:
-        pool.end()
-        raise
-    finally:
-        pool.close()
 
 
 def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) -> None:

@@ -33,7 +33,7 @@ from skillweave.api.running import begun
 from skillweave.cli import commands
 from skillweave.cli.output import Result
 from skillweave.cli.overrides import apply_overrides
-from skillweave.cli.processes import ProcessEnded, processes
+from skillweave.cli.processes import ProcessEnded, Processes
 from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy import training
@@ -209,7 +209,7 @@ Tasks = Sequence[tuple[bytes, Job]]
 
 def _in_processes(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float | str]]:
     """Do each run in a process of its own, as many at once as there are cores."""
-    with processes(min(command.jobs or cores(), len(tasks))) as pool:
+    with Processes(min(command.jobs or cores(), len(tasks))) as pool:
         due = {pool.submit(job.run, code): job for code, job in tasks}
         for future in as_completed(due):
             try:

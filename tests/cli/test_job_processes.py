@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from skillweave.cli.processes import ProcessEnded, processes
+from skillweave.cli.processes import ProcessEnded, Processes
 from skillweave.errors import SkillweaveError
 
 
@@ -37,7 +37,7 @@ def ended_beside_a_child() -> None:
 
 
 def test_jobs_return_or_raise_what_they_did_there():
-    with processes(2) as pool:
+    with Processes(2) as pool:
         results = [pool.submit(doubled, i) for i in range(3)]
         wrong = {job: pool.submit(job) for job in (refused, failed, unsendable)}
         assert [r.result() for r in results] == [0, 2, 4]
@@ -51,7 +51,7 @@ def test_jobs_return_or_raise_what_they_did_there():
 
 def test_a_process_that_is_ended_is_told_at_once_though_another_holds_its_pipe():
     started = time.monotonic()
-    with processes(1) as pool, pytest.raises(ProcessEnded, match="exit code -9"):
+    with Processes(1) as pool, pytest.raises(ProcessEnded, match="exit code -9"):
         pool.submit(ended_beside_a_child).result()
     assert time.monotonic() - started < 25  # its child sleeps for 30 s
 
@@ -60,7 +60,7 @@ def test_an_error_here_ends_all_jobs_and_begins_no_other():
     started, due = time.monotonic(), []
 
     def failing() -> None:
-        with processes(1) as pool:
+        with Processes(1) as pool:
             due.extend(pool.submit(time.sleep, 60) for _ in range(2))
             raise ValueError("enough")
 
