@@ -7,6 +7,20 @@ from typing import Any
 
 import numpy as np
 
+import skillweave as sw
+from skillweave.export.runner import Runner
+from skillweave.export.write import Export
+
+
+def runner_of(export: Export, **how: Any) -> Runner:
+    """The runner of an export, with the functions that it needs."""
+    return Runner(export.path, export.functions, **how)
+
+
+def loaded_of(export: Export) -> Any:
+    """The policy of an export, read back."""
+    return sw.load_policy(export.path, code=export.functions)
+
 
 def episode(env: Any, *actors: Any, seed: int = 0) -> Iterator[list[Any]]:
     """Play an episode by the first actor; yield the actions of all, before each step."""

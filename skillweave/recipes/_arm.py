@@ -18,8 +18,6 @@ NEAR = 0.05
 """Metres from the goal at which the block is there, as Gymnasium-Robotics has it."""
 HOLD = 5
 """Steps for which the block must be there."""
-TABLE = 0.425
-"""Height of the middle of a block on the table, in metres."""
 CAMERA = {
     "distance": 1.2,
     "azimuth": 132.0,
@@ -96,9 +94,22 @@ class Place(gym.Wrapper[Any, Any, Any, Any]):
         if self.holds and self._happens("slip"):
             self.slipping = self.slip_steps
         if not self.holds and self._happens("nudge"):
-            nudge_block(world, block_place(world), world.np_random, self.push)
+            self._nudge(world)
         if self._happens("move"):
             world.goal = world._sample_goal()
+
+    def _nudge(self, world: Any) -> None:
+        """Push the block in a random direction; inwards if it is at the edge of the arm's reach."""
+        angle = world.np_random.uniform(-np.pi, np.pi)
+        way = np.array([np.cos(angle), np.sin(angle)])
+        of = world.model, world.data
+        place = world._utils.get_site_xpos(*of, "object0")
+        inwards = world.initial_gripper_xpos[:2] - place[:2]
+        if np.linalg.norm(inwards) > 0.12:
+            way = inwards / np.linalg.norm(inwards)
+        velocity = world._utils.get_joint_qvel(*of, "object0:joint").copy()
+        velocity[:2] += self.push * way
+        world._utils.set_joint_qvel(*of, "object0:joint", velocity)
 
     def _happens(self, what: str) -> bool:
         """Count down to a disturbance; return whether it happens in this step."""
@@ -116,25 +127,6 @@ def is_held(obs: Array) -> Array:
     closed = obs[..., 9:11].sum(axis=-1) < 0.053
     held: Array = closed & (np.abs(obs[..., 6:9]).max(axis=-1) < 0.03)
     return held
-
-
-def block_place(world: Any) -> Array:
-    """Return the place of the block, (3,)."""
-    place: Array = world._utils.get_site_xpos(world.model, world.data, "object0")
-    return place
-
-
-def nudge_block(world: Any, place: Array, rng: np.random.Generator, speed: float) -> None:
-    """Push the block in a random direction; inwards if it is at the edge of the arm's reach."""
-    angle = rng.uniform(-np.pi, np.pi)
-    way = np.array([np.cos(angle), np.sin(angle)])
-    inwards = world.initial_gripper_xpos[:2] - place[:2]
-    if np.linalg.norm(inwards) > 0.12:
-        way = inwards / np.linalg.norm(inwards)
-    joint = "object0:joint"
-    velocity = world._utils.get_joint_qvel(world.model, world.data, joint).copy()
-    velocity[:2] += speed * way
-    world._utils.set_joint_qvel(world.model, world.data, joint, velocity)
 
 
 def _flat(obs: dict[str, Array]) -> Array:

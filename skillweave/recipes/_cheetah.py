@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from skillweave import EnvSpec, envpool
 from skillweave.envs import PoolWrapper
 from skillweave.errors import DeclarationError, needs_extra
-from skillweave.recipes._specs import named
+from skillweave.recipes._specs import OwnTask, named
 from skillweave.types import Array
 
 ROUND = 1000.0
@@ -87,7 +86,7 @@ def from_log(seen: Array) -> Array:
     return metres
 
 
-class Patrol(gym.Wrapper[Any, Any, Any, Any]):
+class Patrol(OwnTask):
     """A half-cheetah on a route.
 
     Args:
@@ -99,12 +98,6 @@ class Patrol(gym.Wrapper[Any, Any, Any, Any]):
         self.route = Route(points)
         self.leg = np.zeros(1, np.int64)
         self.observation_space = self.route.space(env.observation_space)
-
-    @property
-    def spec(self) -> Any:  # type: ignore[override]  # Gymnasium has it so, too
-        """Return the half-cheetah's spec, without the return at which that is solved."""
-        spec = super().spec
-        return spec and replace(spec, reward_threshold=None)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Start with the first point."""

@@ -7,7 +7,6 @@ side by side in EnvPool (``MissionPool``).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 from skillweave import EnvSpec, envpool
 from skillweave.envs import PoolWrapper
 from skillweave.errors import DeclarationError
-from skillweave.recipes._specs import named
+from skillweave.recipes._specs import OwnTask, named
 from skillweave.types import Array
 
 LANDER = "LunarLander-v3"
@@ -131,7 +130,7 @@ class Progress:
 SPACE = gym.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
 
 
-class Mission(gym.Wrapper[Any, Any, Any, Any]):
+class Mission(OwnTask):
     """One lander with a mission; ``info["success"]`` is true where all of it is done."""
 
     def __init__(
@@ -142,12 +141,6 @@ class Mission(gym.Wrapper[Any, Any, Any, Any]):
         self._me = np.zeros(1, np.int64)
         self._rng = np.random.default_rng()
         self.observation_space = SPACE
-
-    @property
-    def spec(self) -> Any:  # type: ignore[override]  # Gymnasium has it so, too
-        """Return LunarLander's spec, without the return at which that is solved."""
-        spec = super().spec
-        return spec and replace(spec, reward_threshold=None)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Start an episode with a new mission."""

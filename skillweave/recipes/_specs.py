@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -23,6 +24,16 @@ def named(name: str, make: Callable[..., gym.Env[Any, Any]], pool: Any = None) -
 
     one.__name__ = name
     return EnvSpec(one, pool=pool)
+
+
+class OwnTask(gym.Wrapper[Any, Any, Any, Any]):
+    """A wrapper that pays otherwise, so that nothing is solved at the environment's threshold."""
+
+    @property
+    def spec(self) -> Any:  # type: ignore[override]  # Gymnasium has it so, too
+        """Return the environment's spec, without the return at which that is solved."""
+        spec = super().spec
+        return spec and replace(spec, reward_threshold=None)
 
 
 def given(hierarchy: Hierarchy, skills: Mapping[str, Any]) -> Hierarchy:

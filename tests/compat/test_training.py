@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -40,7 +41,8 @@ HP = {
 FIELDS = ["state", "action", "reward", "next_state", "done"]
 
 
-def population(algo: str, env: object, size: int = 1):
+def population(algo: str, size: int = 1, env: Any = None):
+    env = env or makeVectEnvs("CartPole-v1")
     space = env.single_action_space
     actions = int(space.n) if isinstance(space, gym.spaces.Discrete) else space.shape[0]
     state_dim = env.single_observation_space.shape
@@ -81,7 +83,7 @@ def test_an_ended_environment_starts_anew_in_the_same_step():
 
 def test_ppo_trains_and_is_tested_every_few_episodes(capsys):
     env = makeVectEnvs("CartPole-v1", num_envs=2)
-    pop = population("PPO", env, 2)
+    pop = population("PPO", 2)
     found, fitnesses = train_on_policy(
         env, "CartPole-v1", "PPO", pop, n_episodes=5, max_steps=20, evo_epochs=2, evo_loop=2,
         target=None,
@@ -112,7 +114,7 @@ def test_off_policy_algorithms_train(algo):
     torch.manual_seed(0)
     discrete = "DQN" in algo
     env = makeVectEnvs("CartPole-v1" if discrete else "Pendulum-v1", num_envs=2)
-    pop, how = population(algo, env, 2), {}
+    pop, how = population(algo, 2, env), {}
     memory = ReplayBuffer(2, 1000, FIELDS)
     if algo == "Rainbow DQN":
         memory = PrioritizedReplayBuffer(2, 1000, FIELDS, num_envs=2)
@@ -137,7 +139,7 @@ def test_populations_evolve(tmp_path):
         "PPO", 0.1, 0.3, 0.5, 0.3, 0.2, 0.3, ["lr", "batch_size", "learn_step"], 0.1, rand_seed=1
     )
     pop, _ = train_on_policy(
-        env, "CartPole-v1", "PPO", population("PPO", env, 3), n_episodes=4, max_steps=15,
+        env, "CartPole-v1", "PPO", population("PPO", 3), n_episodes=4, max_steps=15,
         evo_epochs=1, target=None, tournament=tournament, mutation=mutation, verbose=False,
         save_elite=True, elite_path=str(tmp_path / "elite.pt"), checkpoint=2,
         checkpoint_path=str(tmp_path / "at.pt"),
@@ -151,24 +153,22 @@ def test_populations_evolve(tmp_path):
 
 def test_every_kind_of_mutation_is_said_and_the_elite_can_be_spared():
     torch.manual_seed(0)
-    env = makeVectEnvs("CartPole-v1")
     said = set()
     for kind in range(5):
         chances = [float(i == kind) for i in range(5)]
         none, arch, param, act, hp = chances
         selection = ["lr", "batch_size", "learn_step"]
         mutation = Mutations("DQN", none, arch, 0.5, param, act, hp, selection, 0.1, rand_seed=kind)
-        pop = mutation.mutation(population("DQN", env, 8))
+        pop = mutation.mutation(population("DQN", 8))
         said |= {a.mut for a in pop}
         assert len({a.mut for a in pop} - {"lr", "bs", "ls"}) == (kind != 4)
     assert said == {"None", "arch", "param", "act", "lr", "bs", "ls"}
     spared = Mutations("DQN", 0, 1, 0.5, 0, 0, 0, [], 0.1, mutate_elite=False)
-    assert [a.mut for a in spared.mutation(population("DQN", env, 3))] == ["None", "arch", "arch"]
+    assert [a.mut for a in spared.mutation(population("DQN", 3))] == ["None", "arch", "arch"]
 
 
 def test_a_tournament_prefers_the_fit():
-    env = makeVectEnvs("CartPole-v1")
-    pop = population("DQN", env, 4)
+    pop = population("DQN", 4)
     for i, agent in enumerate(pop):
         agent.fitness = [float(i)]
         agent.steps = [i]
@@ -206,13 +206,17 @@ def test_the_replay_buffer_gives_back_what_went_in_in_the_old_form():
     assert [float(x.sum()) for x in single.sample(1)] == [0.0, 1.0, 0.5, 3.0, 1.0]
 
 
+def walked(buffer: Any, start: float, steps: int) -> None:
+    """Add steps of one environment that counts on from ``start``, and pays 1 in each."""
+    for i in range(steps):
+        now = np.full((1, 1), start + i)
+        buffer.save2memoryVectEnvs(now, np.zeros(1, int), np.ones(1), now + 1, np.array([False]))
+
+
 def test_n_step_rewards_do_not_reach_over_a_reset_that_nobody_mentioned():
     buffer = MultiStepReplayBuffer(2, 100, FIELDS, num_envs=1, n_step=3, gamma=0.5)
-    for episode in range(2):
-        for i in range(4):
-            at = 100.0 * episode + i
-            now, after = np.full((1, 1), at), np.full((1, 1), at + 1)
-            buffer.save2memoryVectEnvs(now, np.zeros(1, int), np.ones(1), after, np.array([False]))
+    walked(buffer, 0.0, 4)
+    walked(buffer, 100.0, 4)
     *_, drawn = buffer.sample(200, return_idx=True)
     obs, _, reward, after, _ = buffer.sample_from_indices(np.unique(drawn))
     assert reward[:, 0].tolist() == [1.75, 1.75, 1.5, 1.0] * 2
@@ -221,9 +225,7 @@ def test_n_step_rewards_do_not_reach_over_a_reset_that_nobody_mentioned():
 
 def test_priorities_say_what_is_sampled():
     buffer = PrioritizedReplayBuffer(2, 100, FIELDS, num_envs=1)
-    for i in range(50):
-        now = np.full((1, 1), float(i))
-        buffer.save2memoryVectEnvs(now, np.zeros(1, int), np.ones(1), now + 1, np.array([False]))
+    walked(buffer, 0.0, 50)
     *_, weights, idxs = buffer.sample(50, 1.0)
     buffer.update_priorities(idxs, np.where(idxs == 7, 100.0, 1e-6))
     *_, weights, idxs = buffer.sample(64, 1.0)
@@ -270,7 +272,7 @@ def test_tracking_without_wandb_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     env = makeVectEnvs("CartPole-v1")
     with pytest.raises(MissingExtra, match=r"skillweave\[wandb\]"):
-        train_on_policy(env, "CartPole-v1", "PPO", population("PPO", env), wb=True)
+        train_on_policy(env, "CartPole-v1", "PPO", population("PPO"), wb=True)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from goals.worlds import SPACES, GoTo, Point, Rest, go_to, place_of
-from playing import alike
+from playing import alike, loaded_of, runner_of
 from test_networks import agent
 
 import skillweave as sw
@@ -250,14 +250,12 @@ def episodes(env: Point, policy: HierarchyPolicy, runner: Runner, other: Any) ->
 def test_a_hierarchy_with_goals_acts_the_same_elsewhere(make: Any, tmp_path: Path) -> None:
     env, policy = make()
     export = write_export(tmp_path / "a", policy, "point")
-    loaded = sw.load_policy(tmp_path / "a", code=export.functions)
-    runner = Runner(tmp_path / "a", export.functions)
-    told = episodes(env, policy, runner, loaded)
+    loaded = loaded_of(export)
+    told = episodes(env, policy, runner_of(export), loaded)
     assert len({goal for _, goal, _ in told}) > 2  # so that goals are compared
     assert len({str(action) for _, _, action in told}) > 2
     again = write_export(tmp_path / "b", loaded, "point")
-    copied = Runner(tmp_path / "b", again.functions)
-    assert episodes(env, policy, copied, loaded) == told
+    assert episodes(env, policy, runner_of(again), loaded) == told
 
 
 def test_a_selector_that_samples_draws_goals_too(tmp_path: Path) -> None:
@@ -267,7 +265,7 @@ def test_a_selector_that_samples_draws_goals_too(tmp_path: Path) -> None:
     assert entry["selector"]["noise"] == [["gumbel", 2], ["standard_normal", 2]]
     obs, goals = env.reset(seed=0)[0], []
     for seed in range(20):
-        runner = Runner(tmp_path, export.functions, seed=seed)
+        runner = runner_of(export, seed=seed)
         runner.act(obs)
         goals.append(str(policy.goal_now(runner.memory)))
     assert len(set(goals)) > 2  # the other skill, and several goals
@@ -276,7 +274,7 @@ def test_a_selector_that_samples_draws_goals_too(tmp_path: Path) -> None:
 def test_a_selector_that_samples_chooses_goals_that_do_not_hold(tmp_path: Path) -> None:
     """At 0 the goals 2 and 4 hold, and 3 does not; the selector remembers one decision."""
     policy = made(go_to("number"), selector=RECURRENT, greedy_selector=False)[1]
-    runner = Runner(tmp_path, write_export(tmp_path, policy, "point").functions, seed=0)
+    runner = runner_of(write_export(tmp_path, policy, "point"), seed=0)
     obs, seen = np.zeros(2, np.float32), []
     for seed in range(8):
         player = Player(policy, seed=seed)
@@ -299,12 +297,19 @@ def test_the_range_of_goals_is_in_the_file(tmp_path: Path) -> None:
     assert goal["space"] == {
         "type": "Space", "kind": "Box", "dtype": "float32", "shape": [2], "low": low, "high": high
     }  # fmt: skip
-    loaded = sw.load_policy(tmp_path, code=export.functions)
+    loaded = loaded_of(export)
     assert loaded.skills.skills[0].goal_space == GoTo.goal_space
     goal["space"]["low"]["array"] = 3.0
     file.write_text(json.dumps(content))
     with pytest.raises(RunError, match=r"policy.skills\[0\].goals.space: .* is no space"):
-        sw.load_policy(tmp_path, code=export.functions)
+        loaded_of(export)
+
+
+def refused(policy: Any, changed: dict[str, Any], says: str, folder: Path) -> None:
+    """Assert that a runner with other functions says what is wrong with these."""
+    export = write_export(folder, policy, "point")
+    with pytest.raises(SkillError, match=says):
+        Runner(folder, export.functions | changed).act(Point().reset(seed=0)[0])
 
 
 def chosen(name: Any, *goals: Any) -> Any:
@@ -337,24 +342,17 @@ def test_wrong_goals_are_said_by_the_runner(
 ) -> None:
     still = np.zeros(2, np.float32)
     walk = go_to(space, policy=lambda self, obs, goal: np.repeat(still[None], len(obs), 0))
-    env, policy = made(walk, Rest, selector=lambda obs: np.full(len(obs), "rest"))
-    export = write_export(tmp_path, policy, "point")
-    functions = export.functions | {"selector": returned}
-    with pytest.raises(SkillError, match=says):
-        Runner(tmp_path, functions).act(env.reset(seed=0)[0])
+    policy = made(walk, Rest, selector=lambda obs: np.full(len(obs), "rest"))[1]
+    refused(policy, {"selector": returned}, says, tmp_path)
 
 
 def test_goals_of_two_skills_are_given_by_name(tmp_path: Path) -> None:
-    env, policy = made(go_to(), Side(), selector=each)
-    export = write_export(tmp_path, policy, "point")
-    functions = export.functions | {"selector": lambda obs, last: chosen("go_to", -obs / 2)(obs)}
-    with pytest.raises(SkillError, match="go_to, side have goals"):
-        Runner(tmp_path, functions).act(env.reset(seed=0)[0])
+    policy = made(go_to(), Side(), selector=each)[1]
+    changed = {"selector": lambda obs, last: chosen("go_to", -obs / 2)(obs)}
+    refused(policy, changed, "go_to, side have goals", tmp_path)
 
 
 def test_a_clipped_goal_of_another_shape_is_said(tmp_path: Path) -> None:
-    env, policy = made(Reaching, selector=far)
-    export = write_export(tmp_path, policy, "point")
-    functions = export.functions | {"go_to.clip_goal": lambda obs, goal: goal[:, :1]}
-    with pytest.raises(SkillError, match=r"clip_goal\(\) gave goals of shape \(1, 1\)"):
-        Runner(tmp_path, functions).act(env.reset(seed=0)[0])
+    policy = made(Reaching, selector=far)[1]
+    changed = {"go_to.clip_goal": lambda obs, goal: goal[:, :1]}
+    refused(policy, changed, r"clip_goal\(\) gave goals of shape \(1, 1\)", tmp_path)

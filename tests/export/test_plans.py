@@ -9,14 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from goals.worlds import ON, SPACES, Point, Rest, declared
-from playing import episode
+from playing import episode, loaded_of, runner_of
 from ready_selectors.chain import DOOR, PLACE, Corridor, GetKey, Leave, OpenDoor, Wait, at_four
 
 from skillweave import EnvSpec, Lengths
 from skillweave.api.player import Player
-from skillweave.api.policies import load_policy
 from skillweave.errors import PolicyError, SkillError
-from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.planning import (
@@ -87,6 +85,12 @@ def corridor(lengths: bool) -> SkillSet:
     return SkillSet(skills, policies, call_steps=Lengths(1, 2, 4) if lengths else None)
 
 
+def bound(planner: Planner, skills: SkillSet, sees: Any) -> Any:
+    """A planner as the selector of skills."""
+    names = tuple(skill.name for skill in skills.skills)
+    return planner.among(names).bind(sees, gym.spaces.Discrete(skills.choices), "selector")
+
+
 class Walled(Noisy):
     """A wall behind place 3 stands for 14 steps: calls that the log knows fail."""
 
@@ -117,13 +121,10 @@ def test_the_runner_acts_as_the_planner(
 ) -> None:
     skills = corridor(lengths)
     planner = Planner(logs[lengths], TASKS[task], skills=skills)
-    names = tuple(s.name for s in skills.skills)
-    choices = gym.spaces.Discrete(skills.choices)
-    bound = planner.among(names).bind(NOISY.spaces.observation, choices, "selector")
-    policy = HierarchyPolicy(bound, skills)
+    policy = HierarchyPolicy(bound(planner, skills, NOISY.spaces.observation), skills)
     export = write_export(tmp_path, policy, "corridor")
     assert "arrays.npz" in export.files
-    runner, player = Runner(tmp_path, code=export.functions), Player(policy)
+    runner, player = runner_of(export), Player(policy)
     calls_fail = 0
     for seed in range(3):
         for env in (Noisy, Walled):
@@ -131,7 +132,7 @@ def test_the_runner_acts_as_the_planner(
             assert acted == played(env(), player, seed)
             calls_fail += acted != played(Noisy(), runner, seed)
     assert calls_fail, "the wall changes what is done"
-    loaded = Player(load_policy(tmp_path, code=export.functions))
+    loaded = Player(loaded_of(export))
     assert played(Walled(), loaded, 0) == played(Walled(), player, 0)
 
 
@@ -139,9 +140,8 @@ def test_features_and_goals_of_an_export(logs: dict[bool, CallLog], tmp_path: Pa
     skills = corridor(lengths=False)
 
     def exported(planner: Planner) -> Any:
-        names = tuple(s.name for s in skills.skills)
-        bound = planner.among(names).bind(NOISY.spaces.observation, gym.spaces.Discrete(4), "s")
-        return write_export(tmp_path, HierarchyPolicy(bound, skills), "corridor")
+        selector = bound(planner, skills, NOISY.spaces.observation)
+        return write_export(tmp_path, HierarchyPolicy(selector, skills), "corridor")
 
     columns = GoalTask(near, columns=(DOOR,))
     planner = Planner(logs[False], columns)
@@ -150,7 +150,7 @@ def test_features_and_goals_of_an_export(logs: dict[bool, CallLog], tmp_path: Pa
     planner = Planner(logs[False], at_four, features=lambda obs: np.stack([obs[:, PLACE] ** 2], 1))
     export = exported(planner)
     assert export.code["selector.features"] == "observations (n, ...) to features (n, F)"
-    played(Noisy(), Runner(tmp_path, code=export.functions), 1)
+    played(Noisy(), runner_of(export), 1)
 
 
 GOAL_SPACES: dict[str, Any] = {
@@ -233,7 +233,7 @@ def test_the_runner_chooses_the_goals_of_a_plan(case: str, tmp_path: Path) -> No
     run, log, settings = with_goals(space, **how)
     policy = run.plan(THERE_AND_BACK, log, **settings).policy
     export = write_export(tmp_path, policy, "point")
-    runner, player = Runner(tmp_path, code=export.functions), Player(policy)
+    runner, player = runner_of(export), Player(policy)
     goals, calls_fail = set(), 0
     for seed in range(6):
         plain, fenced = ([acted_in(e(), policy, a, seed) for a in (player, runner)] for e in WORLDS)
@@ -255,13 +255,11 @@ def test_a_plan_with_goals_that_guides_is_exported(how: Any, tmp_path: Path) -> 
     """A guide says which skill and length, and the selector beside it which goal."""
     run, log, _ = with_goals("box", **how)
     skills = run.policy.skills
-    names = tuple(skill.name for skill in skills.skills)
-    planner = Planner(log, THERE_AND_BACK, skills=skills).among(names)
-    choices = gym.spaces.Discrete(skills.choices)
-    guide = planner.bind(Point.observation_space, choices, "guide")
+    planner = Planner(log, THERE_AND_BACK, skills=skills)
+    guide = bound(planner, skills, Point.observation_space)
     policy = HierarchyPolicy(run.policy.selector, skills, ActiveGuide(guide))
     export = write_export(tmp_path, policy, "point")
-    runner, player, skills_of = Runner(tmp_path, code=export.functions), Player(policy), set()
+    runner, player, skills_of = runner_of(export), Player(policy), set()
     for seed in range(6):
         for world in WORLDS:
             a, b = (acted_in(world(), policy, actor, seed) for actor in (player, runner))
@@ -281,7 +279,7 @@ def test_a_plan_that_must_call_a_skill_that_was_never_called_says_so(tmp_path: P
     with pytest.warns(UserWarning, match="no call of 'go_to'"):
         policy = run.plan(lambda obs: obs[:, 0] > -5, rests).policy
     export = write_export(tmp_path, policy, "point")
-    runner = Runner(tmp_path, code=export.functions)
+    runner = runner_of(export)
     obs, _ = Point().reset(seed=0)
     runner.act(obs)
     assert runner.memory["skill"].tolist() == [1]

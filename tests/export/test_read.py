@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from hub_server import go_to, serve
+from playing import loaded_of, runner_of
 from reference_calls import Left, Right, T, Zigzag, shy
 from skills.foreign_models import onnx_file
 from skills.mapped_models import ACTION, CASES, SPACE, observations, one, onnx_model, weights
@@ -69,7 +70,7 @@ def test_a_saved_policy_acts_the_same_where_it_is_loaded(name: str, tmp_path: Pa
     export = sw.save_policy(policy, tmp_path / "out", license="MIT", origin="made here")
     for file in tmp_path.glob("*.*"):
         file.unlink()  # the folder is enough
-    loaded = sw.load_policy(tmp_path / "out", code=export.functions)
+    loaded = loaded_of(export)
     assert loaded.observation_space == SPACE
     assert loaded.action_space == ACTION
     acts_alike(policy, loaded, observations(3, 20, seed=5))
@@ -79,7 +80,7 @@ def test_a_saved_policy_acts_the_same_where_it_is_loaded(name: str, tmp_path: Pa
     content = json.loads((tmp_path / "out/policy.json").read_text())
     assert (content["license"], content["origin"]) == ("MIT", "made here")
     again = sw.save_policy(loaded, tmp_path / "again")
-    copied = sw.load_policy(tmp_path / "again", code=again.functions)
+    copied = loaded_of(again)
     acts_alike(policy, copied, observations(3, 10, seed=6))
 
 
@@ -178,15 +179,15 @@ HIERARCHIES: dict[str, Any] = {
 def test_an_export_of_a_hierarchy_acts_the_same(name: str, tmp_path: Path) -> None:
     policy = HIERARCHIES[name]()
     export = write_export(tmp_path / "out", policy, "walk")
-    loaded = sw.load_policy(tmp_path / "out", code=export.functions)
-    told = played([policy, loaded], Runner(tmp_path / "out", export.functions))
+    loaded = loaded_of(export)
+    told = played([policy, loaded], runner_of(export))
     skills, actions, decisions = map(set, zip(*told, strict=True))
     assert len(skills) > 1 or name == "function"  # so that choices are compared
     assert len(actions) > 1
     assert len(told) > 2
     assert decisions == {True, False}  # and calls of several steps
     again = write_export(tmp_path / "again", loaded, "walk")
-    copied = sw.load_policy(tmp_path / "again", code=again.functions)
+    copied = loaded_of(again)
     played([policy, copied], n=2)
 
 

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from playing import alike
+from playing import alike, runner_of
 from reference_calls import POSITION, TAG, Counter, Left, Right, T, Walk, Zigzag, scripted, shy
 from test_networks import agent
 from toys import skills_of
@@ -163,7 +163,7 @@ def test_code_that_is_missing_is_named_with_what_it_is(tmp_path: Path) -> None:
     with pytest.raises(PolicyError, match=r"shy\.condition.*observations .* bool"):
         Runner(tmp_path)
     assert set(export.functions) == set(export.code)
-    assert Runner(tmp_path, export.functions).act(np.zeros(4, np.float32)) in range(3)
+    assert runner_of(export).act(np.zeros(4, np.float32)) in range(3)
 
 
 def test_two_functions_of_one_name_are_told_apart(tmp_path: Path) -> None:
@@ -228,7 +228,7 @@ def test_a_selector_that_samples_in_any_case_samples_when_exported(tmp_path: Pat
     skills = skill_set(Careful, Left, Zigzag, Right, greedy_selector=False)
     export = write_export(tmp_path / "other", ready(AUTOMATON, skills), "walk")
     far_left = np.array([-8.0, 0, 0, 0], np.float32)
-    runners = [Runner(tmp_path / "other", export.functions, seed=seed) for seed in range(20)]
+    runners = [runner_of(export, seed=seed) for seed in range(20)]
     assert all(runner.act(far_left) in range(3) for runner in runners)
     drawn = {int(runner.memory["skill"][0]) for runner in runners}
     assert len(drawn) == 2  # of the skills of its first state

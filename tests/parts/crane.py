@@ -14,6 +14,7 @@ from small_runs import goes_on
 import skillweave as sw
 
 SMALL = sw.Network(hidden=(8,))
+GREEDY = sw.Selection(greedy_skills=True, greedy_selector=True)
 ON = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
 
 
@@ -104,6 +105,11 @@ def crane(skills: Any = None, **how: Any) -> sw.Hierarchy:
         "selector": ON,
     } | how
     return sw.Hierarchy(settings.pop("env"), skills or [Arm(), Hook()], **settings)
+
+
+def greedy(skills: Any = None, **how: Any) -> sw.Run:
+    """Return a short run, whose skills and selector act greedily."""
+    return crane(skills, **{"steps": 130, "selection": GREEDY} | how).train(seed=0, quiet=True)
 
 
 def goes_on_and_loads(hierarchy: Callable[[], sw.Hierarchy], folder: Path) -> None:

@@ -10,31 +10,29 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from crane import ON, Arm, Crane, Hook, crane
-from playing import alike, episode
+from crane import GREEDY, ON, Arm, Crane, Hook, crane, greedy
+from playing import alike, episode, loaded_of, runner_of
 from torch import nn
 
 import skillweave as sw
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.errors import SkillError
-from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.skills.mapping import Part
 
 pytest.importorskip("onnxscript")
-GREEDY = sw.Selection(greedy_skills=True, greedy_selector=True)
 
 
-def compare(policy: Any, folder: Any, code: Any) -> None:
+def compare(policy: Any, export: Any) -> None:
     """Let a player, the runner, and the policy that is read back act in two episodes."""
-    actors = sw.Player(policy), Runner(folder, code), sw.Player(sw.load_policy(folder, code=code))
+    actors = sw.Player(policy), runner_of(export), sw.Player(loaded_of(export))
     actions = [a for seed in range(2) for a in alike(Crane(), *actors, seed=seed)]
     assert len(np.unique(np.round(actions, 4), axis=0)) > 3
 
 
 def exported(run: Any, folder: Any) -> None:
-    compare(run.policy, folder, run.export(folder).functions)
+    compare(run.policy, run.export(folder))
 
 
 def in_turn(obs: Any) -> Any:
@@ -62,10 +60,7 @@ def skills(sees: Any) -> Any:
 )
 @pytest.mark.parametrize("rest", ["hold", (0.0, 0.5, "hold")])
 def test_learnt_skills_with_parts(sees, rest, tmp_path):
-    run = crane(skills(sees), selector=in_turn, rest=rest, steps=130, selection=GREEDY).train(
-        quiet=True
-    )
-    exported(run, tmp_path / "out")
+    exported(greedy(skills(sees), selector=in_turn, rest=rest), tmp_path / "out")
 
 
 @pytest.mark.fast_cases(2)
@@ -79,11 +74,9 @@ def test_choices_with_parts(kind, tmp_path):
 
     rest = {} if kind == "one" else {"rest": "hold"}
     env = sw.EnvSpec(lambda: Crane(kind), engine="sync", workers=1)
-    how = {"selector": in_turn, "steps": 130, "selection": GREEDY}
-    run = crane(declared(), env=env, **how, **rest).train(quiet=True)
-    code = run.export(tmp_path / "out").functions
-    loaded = sw.load_policy(tmp_path / "out", code=code)
-    actors = run.player(), Runner(tmp_path / "out", code), sw.Player(loaded)
+    run = greedy(declared(), env=env, selector=in_turn, **rest)
+    export = run.export(tmp_path / "out")
+    actors = run.player(), runner_of(export), sw.Player(loaded_of(export))
     for action, *others in episode(Crane(kind), *actors):
         assert all(np.array_equal(theirs, action) for theirs in others)
 
@@ -98,9 +91,9 @@ def test_a_mask_is_cut_in_the_runner(tmp_path):
         acts = (0, 1, 3)
 
     env = sw.EnvSpec(lambda: Crane("one", True), engine="sync", workers=1)
-    run = crane([Some()], env=env, steps=130, selection=GREEDY).train(quiet=True)
+    run = greedy([Some()], env=env)
     export = run.export(tmp_path / "out")
-    world, runner = Crane("one", True), Runner(tmp_path / "out", export.functions)
+    world, runner = Crane("one", True), runner_of(export)
     for action, theirs in episode(world, runner, run.player()):
         assert action == theirs
         assert world._info()["action_mask"][action]
@@ -128,8 +121,7 @@ def test_corrections(name, acts, tmp_path):
         base = two if ready is None else sw.from_torch(ready, sees=("arm", "hook"))
     skill = type("Better", (sw.Skill,), {"policy": sw.Residual(base, 0.5), "acts": acts})()
     rest = {} if acts is None else {"rest": (0.0, 0.25, 0.0)}
-    run = crane([skill], steps=130, selection=GREEDY, **rest).train(quiet=True)
-    exported(run, tmp_path / "out")
+    exported(greedy([skill], **rest), tmp_path / "out")
 
 
 ARM: Any = gym.spaces.Box(-1, 1, (2,), np.float32)
@@ -188,8 +180,7 @@ def linear(inputs: int, outputs: int) -> Any:
 
 def trained() -> Any:
     """The policy of a skill with a goal that was trained before: it sees both as one."""
-    run = crane([reach(), Hook()], steps=130).train(quiet=True)
-    return run.policy.skills.policies[0]
+    return greedy([reach(), Hook()]).policy.skills.policies[0]
 
 
 def far(selector: Any, rest: Any) -> sw.Skill:
@@ -245,11 +236,10 @@ def test_skills_with_goals_and_parts(case: str, tmp_path: Any) -> None:
     skill = make()
     if selector is RULE:
         selector = in_parts if skill.goal_space is AIM else partial(there_and_up, skill=skill.name)
-    how = {"selector": selector, "rest": rest, "steps": 130, "selection": GREEDY}
-    policy = louder(crane([skill, Hook()], **how).train(seed=0, quiet=True).policy)
+    policy = louder(greedy([skill, Hook()], selector=selector, rest=rest).policy)
     export = write_export(tmp_path / "out", policy, "crane")
-    compare(policy, tmp_path / "out", export.functions)
-    runner = Runner(tmp_path / "out", export.functions)
+    compare(policy, export)
+    runner = runner_of(export)
     goals = {str(policy.goal_now(runner.memory)) for _ in episode(Crane(), runner, seed=3)}
     assert len(goals) > 2
 
@@ -257,13 +247,12 @@ def test_skills_with_goals_and_parts(case: str, tmp_path: Any) -> None:
 def test_a_plan_of_skills_with_goals_and_parts(tmp_path: Any) -> None:
     """Skill, goal and action are the policy's, where observations are a Dict."""
     skill = reach(policy=sw.Residual(to_the_goal, 0.5))
-    how = {"rest": FIXED, "steps": 130, "selection": GREEDY}
-    run = crane([skill, Hook()], **how).train(seed=0, quiet=True)
+    run = greedy([skill, Hook()], rest=FIXED)
     log = run.log_calls(1_000, num_envs=4)
     planned = run.plan(lambda obs: (obs["arm"] > 0.3).all(1), log, features=[0, 1, 2])
     export = planned.export(tmp_path / "out")
     assert "observations (n, ...) to features (n, F)" in export.code.values()
-    runner, player, goals = Runner(tmp_path / "out", export.functions), planned.player(), set()
+    runner, player, goals = runner_of(export), planned.player(), set()
     for seed in range(3):
         for _ in alike(Crane(), player, runner, seed=seed):
             goals.add(str(planned.policy.goal_now(runner.memory)))
@@ -271,7 +260,5 @@ def test_a_plan_of_skills_with_goals_and_parts(tmp_path: Any) -> None:
 
 
 def test_a_hierarchy_that_a_skill_corrects(tmp_path):
-    ready = crane(steps=130, selection=GREEDY).train(quiet=True).policy
-    skill = type("Better", (sw.Skill,), {"policy": sw.Residual(ready)})()
-    run = crane([skill], steps=130, selection=GREEDY).train(quiet=True)
-    exported(run, tmp_path / "out")
+    skill = type("Better", (sw.Skill,), {"policy": sw.Residual(greedy().policy)})()
+    exported(greedy([skill]), tmp_path / "out")

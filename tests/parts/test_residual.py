@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from crane import SMALL, Arm, Crane, Hook, acted, crane, goes_on_and_loads
+from crane import SMALL, Arm, Crane, Hook, acted, crane, goes_on_and_loads, greedy
 from small_runs import reports_every
 from torch import nn
 
@@ -19,7 +19,6 @@ from skillweave.evolution import Evolution
 
 often = reports_every(40)
 OFTEN = sw.TrainDefaults(checkpoint_every=60)
-GREEDY = sw.Selection(greedy_skills=True)
 SAC = sw.SAC(num_envs=4, batch_size=16, learning_starts=20, buffer_size=500, network=SMALL)
 
 
@@ -85,7 +84,7 @@ def test_a_stopped_run_ends_with_the_same_weights(name, how, tmp_path):
 def test_the_correction_is_added_to_the_ready_policy(name):
     ready = bases()[name]
     skill = declared(copy.deepcopy(ready), scale=(0.5, 0.25, 0.1))
-    run = crane([skill], steps=130, selection=GREEDY).train(quiet=True)
+    run = greedy([skill])
     learnt = run.policy.skills.policies[0]
     assert isinstance(learnt, AgentPolicy)
     base = ready if hasattr(ready, "bind") else sw.from_function(ready)
@@ -106,14 +105,14 @@ def test_the_correction_is_added_to_the_ready_policy(name):
 def test_training_starts_at_the_ready_policy():
     skill = declared(middle, scale=0.2)
     one = sw.PPO(num_envs=4, n_steps=16, batch_size=32, learning_rate=1e-12, network=SMALL)
-    run = crane([skill], steps=64, algorithm=one, selector=one, selection=GREEDY).train(quiet=True)
+    run = greedy([skill], steps=64, algorithm=one, selector=one)
     ready = sw.from_function(middle).bind(Crane.observation_space, Crane().action_space, "base")
     assert np.abs(acted(run.player()) - acted(sw.Player(ready))).max() < 0.02
 
 
 def test_the_skill_alone_acts_as_in_the_hierarchy():
     skill = declared(sw.from_function(counted, every=3))
-    run = crane([skill], selection=GREEDY).train(quiet=True)
+    run = greedy([skill])
     alone = run._policy("better")
     assert (acted(sw.Player(alone)) == acted(run.player())).all()
     assert run.evaluate(2, skill="better").skills["better"].calls == 2
@@ -130,7 +129,7 @@ def test_a_call_after_another_skill_starts_the_ready_policy_afresh():
             return np.zeros((len(obs), 3), np.float32)
 
     better = declared(sw.from_function(counted, every=3), scale=1e-9)
-    run = crane([better, Still()], selector=turns, selection=GREEDY).train(quiet=True)
+    run = greedy([better, Still()], selector=turns)
     actions = acted(run.player())[:, 0]
     assert np.allclose(actions[:4], [0, 0, 0, 0.3], atol=1e-6)
     assert np.allclose(actions[8:12], [0.8, 0.8, 0.8, 1.0], atol=1e-6)
@@ -283,7 +282,7 @@ def test_an_action_without_bounds_is_corrected_in_its_own_unit():
 
     world = sw.EnvSpec(Free, engine="sync", workers=1)
     skill = declared(middle, 0.5)
-    run = crane([skill], env=world, steps=130, selection=GREEDY).train(quiet=True)
+    run = greedy([skill], env=world)
     env, player = Free(), run.player()
     obs, _ = env.reset(seed=0)
     seen = player._seen(obs)

@@ -67,6 +67,13 @@ def test_each_skill_learns_on_its_own_numbers(learn):
     assert alone.skills["arm"].calls == 2
 
 
+@pytest.fixture(scope="module")
+def held(tmp_path_factory: pytest.TempPathFactory) -> sw.Run:
+    """A run in which the rest of the action is held."""
+    folder = tmp_path_factory.mktemp("held")
+    return crane(selector=in_turn, rest="hold").train(folder, quiet=True)
+
+
 def test_the_rest_is_held():
     run = crane(selector=in_turn, rest=("hold", 0.25, "hold")).train(quiet=True)
     actions, _ = actions_of(run.policy)
@@ -81,9 +88,8 @@ def test_the_rest_is_held():
 
 
 @pytest.mark.parametrize("skill", ["arm", "hook"])
-def test_a_skill_alone_acts_as_in_the_hierarchy(skill):
-    run = crane(selector=in_turn, rest="hold").train(quiet=True)
-    actions = acted(run.player(skill=skill))
+def test_a_skill_alone_acts_as_in_the_hierarchy(skill, held):
+    actions = acted(held.player(skill=skill))
     assert (actions[:, 2 if skill == "arm" else 0] == 0).all()
     assert actions.any()
 
@@ -379,9 +385,8 @@ def test_a_population_learns_parts(tmp_path):
     assert run.policy.skills.policies[0].action_space.shape == (2,)
 
 
-def test_options_env_calls_skills_with_parts():
-    run = crane(selector=in_turn, rest="hold").train(quiet=True)
-    env = sw.make_options_env(run, 2, 0.99)
+def test_options_env_calls_skills_with_parts(held):
+    env = sw.make_options_env(held, 2, 0.99)
     env.reset(seed=0)
     before = env.engine.steps_made
     *_, info = env.step(np.array([0, 1]))
@@ -390,11 +395,10 @@ def test_options_env_calls_skills_with_parts():
     env.close()
 
 
-def test_calls_are_logged(tmp_path):
-    run = crane(selector=in_turn, rest="hold").train(tmp_path / "run", quiet=True)
-    log = run.log_calls(200)
+def test_calls_are_logged(held):
+    log = held.log_calls(200)
     assert log.action.shape[1:] == (3,)
-    log.check_skills(run.policy.skills)
+    log.check_skills(held.policy.skills)
     other = crane(selector=in_turn).train(quiet=True)
     with pytest.raises(RunError, match="has changed since the log was recorded"):
         log.check_skills(other.policy.skills)

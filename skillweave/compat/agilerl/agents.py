@@ -66,13 +66,13 @@ class PPO(Agent):
     def become(self, member: Member) -> None:
         """Continue as another member; see the base."""
         super().become(member)
-        self.actor = NumpyActor(self.learner, member.state)
+        self.numpy_actor = NumpyActor(self.learner, member.state)
 
     def getAction(self, state: Any, action: Any = None, grad: bool = False) -> tuple[Array, ...]:
         """Sample actions int64 (B,) or float32 (B, A); log-probabilities, entropies, values."""
         if action is not None or grad:
             raise DeclarationError("getAction(action=, grad=) is a part of learning: use learn()")
-        return self.actor.sample(self.rows(state), self.rng)
+        return self.numpy_actor.sample(self.rows(state), self.rng)
 
     def learn(self, experiences: Any, noise_clip: float = 0.5, policy_noise: float = 0.2) -> float:
         """Learn from T states, actions, log-probabilities, rewards, terminations and values.
@@ -82,7 +82,7 @@ class PPO(Agent):
         self.updates += 1
         rng = [(self.seeds / "update" / self.updates).torch()]
         _, report = self.learner.update(self.member.state, self.rollout(experiences), rng)
-        self.actor = NumpyActor(self.learner, self.member.state)
+        self.numpy_actor = NumpyActor(self.learner, self.member.state)
         losses = {k: float(v) for k, v in report.metrics.items()}
         value_part = self.vf_coef * losses["value_loss"] - self.ent_coef * losses["entropy"]
         return float(losses["policy_loss"] + value_part)
@@ -94,7 +94,7 @@ class PPO(Agent):
         count as drawn with the log-probabilities given.
         """
         states, action, log_prob, reward, ended, _, after = experiences
-        learner, member_state = self.learner, self.member.state
+        learner, state = self.learner, self.member.state
         rewards = tensor_of(reward, np.float32)
         lead = 1, len(rewards), max(1, rewards[0].numel())
         obs = to_tensor(self.rows(states)).unflatten(0, lead)
@@ -103,14 +103,14 @@ class PPO(Agent):
         last[:, -1] = True
         kind = np.int64 if learner.codec.discrete else np.float32
         actions = tensor_of(action, kind).view(*lead, *(self.spaces[1].shape or ()))
-        log_std = learner.layout.views(member_state.params).get("actor.log_std")
+        log_std = learner.layout.views(state.params).get("actor.log_std")
         log_std = None if log_std is None else log_std[:, None].clone()
         log_probs = tensor_of(log_prob, np.float32).view(lead)
         return Rollout(
             obs,
             actions,
             rewards.view(lead),
-            member_state.gamma[:, None, None] * ~ends,
+            state.gamma[:, None, None] * ~ends,
             torch.cat([obs[:, 1:], to_tensor(self.rows(after))[None, None]], 1),
             last,
             dist_params=learner.head.with_log_prob(actions, log_probs, log_std),
