@@ -185,7 +185,7 @@ def _check_grows(run: RunDirectory, entry: StageEntry, more: int) -> None:
     left = entry.budget + more - (entry.steps or 0)
     for learner, config in _algorithms(entry).items():
         waits = config.get("learning_starts", 0)
-        place = "extra.learner." + (f"{learner}." if entry.together else "") + "store."
+        place = "learner." + (f"{learner}." if entry.together else "") + "store."
         if left <= waits and not any(tensor.startswith(place) for tensor in tensors):
             raise RunError(
                 f"{run.path}: {learner!r} would learn nothing in {left:,} more steps, as its "

@@ -81,19 +81,19 @@ class EvolvingPopulation:
             self.parts = Parts(self._where.workers, *how)
             self._open.callback(self.parts.close)
 
-    def go_on(self, extra: dict[str, Tensor], log: StageLog) -> None:
-        """Restore a checkpoint, whose members are in ``extra``."""
+    def go_on(self, tensors: dict[str, Tensor], log: StageLog) -> None:
+        """Restore a checkpoint, whose members are in ``tensors``."""
         self.log = log
-        if extra:
-            self._restore(extra)
+        if tensors:
+            self._restore(tensors)
         else:
             self.population = Population.fresh(
                 self.config, self.evolution, self.task, self.seeds, self.parts
             )
         part = self.population.part
         self._open.callback(part.close)
-        if extra:
-            saved, store = unprefixed("collector", extra), unprefixed("store", extra)
+        if tensors:
+            saved, store = unprefixed("collector", tensors), unprefixed("store", tensors)
             ids = resumed(log, lambda: part.restore(saved, self.population.members, store))
             log.report_reset(len(ids), part.num_envs)
         self._started: float = time.perf_counter() - log.at.seconds

@@ -47,8 +47,8 @@ class Checkpoints:
 
     def load(
         self, stage: str, check: Callable[[str | None, Path], None]
-    ) -> tuple[dict[str, Tensor], Checkpoint, Path] | None:
-        """Return tensors, header and file of a stage's latest good checkpoint; None: it has none.
+    ) -> tuple[dict[str, Tensor], Checkpoint] | None:
+        """Return tensors and header of a stage's latest good checkpoint; None: it has none.
 
         Args:
             stage: its name.
@@ -67,7 +67,7 @@ class Checkpoints:
                     continue
                 checkpoint: Checkpoint = record_in(Checkpoint, header, path)
                 check(checkpoint.run, path)
-                return tensors, checkpoint, path
+                return tensors, checkpoint
             except SkillweaveError as error:
                 problems.append(str(error))
         if problems:

@@ -63,7 +63,6 @@ from skillweave.runs.manifest import (
     versions,
 )
 from skillweave.schema import as_json
-from skillweave.types import unprefixed
 
 S = TypeVar("S")
 First = Callable[["RunDirectory"], None]
@@ -286,34 +285,24 @@ class RunDirectory:
         """Return whether the comparison that chooses the best hierarchy is still missing."""
         return any(s.kept is None and s.needs_comparison for s in self.manifest.stages)
 
-    def save_checkpoint(
-        self, state: Any | None, header: Checkpoint, extra: Mapping[str, Tensor] | None = None
-    ) -> None:
+    def save_checkpoint(self, header: Checkpoint, tensors: Mapping[str, Tensor]) -> None:
         """Write a stage's latest checkpoint; the one before stays beside it.
 
         Args:
-            state: a dataclass of tensors; None: all is in ``extra``.
             header: the stage's progress; run and sizes of files are filled in.
-            extra: further tensors for resuming: environments, a replay buffer.
+            tensors: all that resuming needs: states of learners, environments, replay buffers.
         """
         self.check()
-        self._checkpoints.save(*self._as_checkpoint(state, header, extra))
+        self._checkpoints.save(tensors, self._filled(header))
 
-    def save_final(
-        self, state: Any | None, header: Checkpoint, extra: Mapping[str, Tensor] | None = None
-    ) -> None:
+    def save_final(self, header: Checkpoint, tensors: Mapping[str, Tensor]) -> None:
         """Write a stage's final state; arguments as in ``save_checkpoint``."""
-        stage = header.stage
-        self.write(FINAL, stage, *self._as_checkpoint(state, header, extra), stage)
+        self.write(FINAL, header.stage, tensors, self._filled(header), header.stage)
 
-    def _as_checkpoint(
-        self, state: Any | None, header: Checkpoint, extra: Mapping[str, Tensor] | None
-    ) -> tuple[dict[str, Tensor], Checkpoint]:
-        tensors = {} if state is None else dict(vars(state))
-        tensors |= {f"extra.{k}": v for k, v in (extra or {}).items()}
+    def _filled(self, header: Checkpoint) -> Checkpoint:
         header = replace(header, run=self.manifest.id)
         self.record_lines(header)
-        return tensors, header
+        return header
 
     def drop_checkpoints(self) -> None:
         """Remove the checkpoints of a stage that ``run.json`` marks as done."""
@@ -338,18 +327,11 @@ class RunDirectory:
             remove(path)
         return self._checkpoints.drop_previous() or bool(spare)
 
-    def load_checkpoint(
-        self, stage: str, like: Any
-    ) -> tuple[Any, Checkpoint, dict[str, Tensor]] | None:
-        """Return state, header and extra of a stage's latest good checkpoint; None: it has none.
+    def load_checkpoint(self, stage: str) -> tuple[dict[str, Tensor], Checkpoint] | None:
+        """Return tensors and header of a stage's latest good checkpoint; None: it has none.
 
         Without a checkpoint, use the final state of a stage that continues, or whose budget is
         spent.
-
-        Args:
-            stage: its name.
-            like: a state with the required shapes and types, a dataclass of tensors; None: no
-                state.
 
         Raises:
             RunError: checkpoints of this stage exist, but all are damaged.
@@ -359,21 +341,10 @@ class RunDirectory:
             entry = self.stage(stage)
             if entry.continued or final[1].steps >= entry.budget:
                 checkpoint = final
-        if checkpoint is None:
-            return None
-        tensors, header, path = checkpoint
-        extra = unprefixed("extra", tensors)
-        tensors = {k: v for k, v in tensors.items() if not k.startswith("extra.")}
-        if tensors.keys() != (set() if like is None else vars(like).keys()):
-            raise RunError(
-                f"{path} has other fields than this version of Skillweave resumes from: finish the "
-                "run with the version that started it, or delete the file to train the stage again"
-            )
-        state = None if like is None else state_from(tensors, like, str(path))
-        return state, header, extra
+        return checkpoint
 
-    def _final(self, stage: str) -> tuple[dict[str, Tensor], Checkpoint, Path] | None:
-        """Return tensors, header and file of a stage's final state; None: it has none."""
+    def _final(self, stage: str) -> tuple[dict[str, Tensor], Checkpoint] | None:
+        """Return tensors and header of a stage's final state; None: it has none."""
         path = self.file(FINAL, stage)
         if not path.exists():
             return None
@@ -388,7 +359,7 @@ class RunDirectory:
             header.metrics_bytes = header.lineage_bytes = None
             if entry.evaluation_steps is not None:
                 header.evaluation_steps = entry.evaluation_steps
-        return tensors, header, path
+        return tensors, header
 
     def final_tensors(self, stage: str) -> list[str]:
         """Return the names of the tensors of a stage's final state; empty: it has none.

@@ -131,10 +131,10 @@ class Agents:
                 margins[relative(path, self.level)] = role.margin
         return margins
 
-    def go_on(self, extra: dict[str, Tensor], log: StageLog) -> None:
-        """Restore a checkpoint, or prepare to start where ``extra`` is empty."""
+    def go_on(self, tensors: dict[str, Tensor], log: StageLog) -> None:
+        """Restore a checkpoint, or prepare to start where ``tensors`` is empty."""
         self.log = log
-        self.learners = {name: self._learner(name, extra) for name in self.algorithms}
+        self.learners = {name: self._learner(name, tensors) for name in self.algorithms}
         self.joint: JointLearner | None = None
         self.learner: Learner
         if self.together is None:
@@ -142,7 +142,7 @@ class Agents:
         else:
             how = self.level, self.together.task_weight, self.entry.task_weights
             self.learner = self.joint = JointLearner(self.learners, *how)
-        self.best.load(log.at.kept_best, extra, self.states(), str(log.run.path))
+        self.best.load(log.at.kept_best, tensors, self.states(), str(log.run.path))
         recorder = self.stage.recorder
         self.loop = loop = Loop(
             self.learner,
@@ -156,19 +156,19 @@ class Agents:
             on_checkpoint=self._on_checkpoint,
             on_calls=None if recorder is None else recorder.add,
         )
-        if extra:
-            ids = resumed(log, lambda: loop.restore(extra))
+        if tensors:
+            ids = resumed(log, lambda: loop.restore(tensors))
             log.report_reset(len(ids), self.collectors.num_envs)
 
-    def _learner(self, name: str, extra: dict[str, Tensor]) -> Learner:
+    def _learner(self, name: str, tensors: dict[str, Tensor]) -> Learner:
         """Return a learner that continues from a checkpoint or an earlier stage, or is fresh."""
         state, algorithm = self._initial_state(name), self.algorithms[name]
-        if self.together and self.earlier[name] is not None and not extra:
+        if self.together and self.earlier[name] is not None and not tensors:
             self._report_lost_state(name)
         device = resolve_device(algorithm.config.device)
         reference = self._reference(name, state, device)
-        if extra:
-            saved = unprefixed(f"state.{name}", extra)
+        if tensors:
+            saved = unprefixed(f"state.{name}", tensors)
             state = state_from(saved, state, f"{self.log.run.path}: {name}")
         learner = learner_of(
             Stack(algorithm, state_to(state, device)),

@@ -61,7 +61,7 @@ class KeepBest:
     def load(
         self,
         found: BestSoFar | None,
-        extra: Mapping[str, Tensor],
+        tensors: Mapping[str, Tensor],
         like: Mapping[str, Any],
         where: str,
     ) -> None:
@@ -69,14 +69,14 @@ class KeepBest:
 
         Args:
             found: of the checkpoint's header.
-            extra: its tensors beside the state.
+            tensors: of the checkpoint.
             like: states of the learners' shapes, by name.
             where: the run, for messages.
         """
         self.found = found
         if found is None:
             return
-        saved = unprefixed("best", dict(extra))
+        saved = unprefixed("best", dict(tensors))
         self.states = {
             name: state_from(unprefixed(name, saved), example, f"{where}: the best of {name}")
             for name, example in like.items()

@@ -116,7 +116,7 @@ class StageLog:
         The updates and steps of ``at`` must be of this moment; its metrics are the latest reported
         ones.
         """
-        self.run.save_checkpoint(None, self.at, tensors)
+        self.run.save_checkpoint(self.at, tensors)
         self._notify_callbacks()
 
     def _notify_callbacks(self) -> None:
@@ -197,7 +197,7 @@ class StageLog:
         small = sum(x.numel() * x.element_size() for x in spare.values()) <= LARGEST_SPARE
         for tensors in ({**needed, **spare}, needed) if spare and small else (needed,):
             try:
-                write(None, self.at, tensors)
+                write(self.at, tensors)
             except RunError as error:
                 problem = error
             else:

@@ -52,8 +52,8 @@ class StageLearner(Protocol):
         """Make the environments."""
         ...
 
-    def go_on(self, extra: dict[str, Tensor], log: StageLog) -> None:
-        """Restore a checkpoint, or prepare to start where ``extra`` is empty."""
+    def go_on(self, tensors: dict[str, Tensor], log: StageLog) -> None:
+        """Restore a checkpoint, or prepare to start where ``tensors`` is empty."""
         ...
 
     def train(self) -> dict[str, AgentPolicy]:

@@ -80,10 +80,9 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
     ):
         try:
             learner.open()
-            checkpoint = run.load_checkpoint(stage.name, None)
-            _, at, extra = checkpoint or (None, Checkpoint.start(stage.name), {})
+            saved, at = run.load_checkpoint(stage.name) or ({}, Checkpoint.start(stage.name))
             log = StageLog(stage.name, run, course.listeners, at)
-            learner.go_on(extra, log)
+            learner.go_on(saved, log)
             policies = learner.train()
         finally:
             learner.close()

@@ -328,14 +328,14 @@ def test_members_that_are_to_train_hold_no_nan_in_a_checkpoint(name, tmp_path, m
     killed_at_save(name, tmp_path / "run", 1, monkeypatch)
     file = tmp_path / "run" / "checkpoint.safetensors"
     tensors, header = read_tensors(file)
-    state = [k for k, v in tensors.items() if k.startswith("extra.1.") and v.is_floating_point()]
-    assert {"extra.1.params", "extra.1.return_mean", "extra.1.gamma"} <= set(state)
+    state = [k for k, v in tensors.items() if k.startswith("1.") and v.is_floating_point()]
+    assert {"1.params", "1.return_mean", "1.gamma"} <= set(state)
     declaration = Agent(spec(name), CONFIGS[name], 256)
     for key in state:
         altered = tensors[key].clone()
         altered.view(-1)[0] = float("nan")
         write_tensors(file, tensors | {key: altered}, header)
-        said = f"member 1: tensor {key.removeprefix('extra.1.')} holds NaN"
+        said = f"member 1: tensor {key.removeprefix('1.')} holds NaN"
         with pytest.raises(SkillweaveError, match=said):
             declaration.resume(tmp_path / "run", quiet=True)
 

@@ -188,8 +188,8 @@ def test_the_best_is_in_the_checkpoint_once(
     best = max(found, key=lambda steps: (found[steps], steps))
     assert header["kept_best"]["steps"] == best
     assert header["kept_best"]["metrics"]["eval_return"] == found[best]
-    size = sum(v.nbytes for k, v in tensors.items() if k.startswith("extra.best."))
-    state = sum(v.nbytes for k, v in tensors.items() if k.startswith("extra.state."))
+    size = sum(v.nbytes for k, v in tensors.items() if k.startswith("best."))
+    state = sum(v.nbytes for k, v in tensors.items() if k.startswith("state."))
     assert size == state > 0
     assert not list((tmp_path / "run").glob("*best*"))
 
