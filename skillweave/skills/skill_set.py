@@ -37,7 +37,7 @@ class LimitedCalls(Choices):
 
 @dataclass(frozen=True)
 class SkillSet(LimitedCalls):
-    """Skills with their policies, and the limits of their calls; ``hierarchy_of`` lets them act."""
+    """Skills with their policies, and the limits of their calls; for ``acting_policy``."""
 
     skills: tuple[Skill, ...]
     policies: tuple[Any, ...]
@@ -66,7 +66,7 @@ class SkillSet(LimitedCalls):
     @cached_property
     def hierarchy(self) -> Hierarchy:
         """The skills in calls, without a selector."""
-        return hierarchy_of(self)
+        return within(acting_policy(self, outermost=False))
 
     @property
     def action_space(self) -> gym.Space[Any]:
@@ -100,14 +100,29 @@ def acting_policy(
     *,
     outermost: bool = True,
 ) -> Policy:
-    """Return the policy of a selector and its skills, with reflexes.
+    """Return skills in calls, with reflexes.
 
     Args:
-        selector, guide, goals: see ``hierarchy_of``.
+        skills: with their policies; one that has skills and a selector itself is a hierarchy.
+        selector: chooses where a call has ended; None: the caller does, by ``begin``.
+        guide: a ready selector that restricts the choices.
+        goals: of the hierarchy, as a skill that has goals.
         outermost: it remembers the last action, where that counts for a skill; else
             it is in the ``World``.
     """
-    policy: Policy = hierarchy_of(skills, selector, guide, goals)
+    if guide is not None and guide.decides:
+        selector, guide = guide.selector, None
+    policy: Policy = Hierarchy(
+        None if selector is None else selects(selector, "the selector's act()"),
+        tuple(_skill(skills, i) for i in range(len(skills.skills))),
+        lengths=skills.lengths,
+        guide=guide and replace(guide, selector=selects(guide.selector, "the guide")),
+        interruption=skills.interruption,
+        fresh_calls=goals is not None,
+        greedy=skills.greedy,
+        greedy_selector=skills.greedy_selector,
+        ask=ask,
+    )
     if skills.reflexes:
         policy = Reflexes(policy, skills.reflexes, space_of(skills.action_space))
     return _remembering(policy, skills) if outermost else policy
@@ -119,36 +134,6 @@ def acting_alone(skills: SkillSet, i: int) -> Policy:
     policy = acting_apart(skills.policies[i], skill, skills.part(i), skills.reflexes, space)
     goals = goals_of(skill)
     return _remembering(policy if goals is None else Given(policy, goals), skills)
-
-
-def hierarchy_of(
-    skills: SkillSet,
-    selector: Any = None,
-    guide: ActiveGuide | None = None,
-    goals: Goals | None = None,
-) -> Hierarchy:
-    """Return skills in calls.
-
-    Args:
-        skills: with their policies; one that has skills and a selector itself is a hierarchy.
-        selector: chooses where a call has ended; None: the caller does, by ``begin``.
-        guide: a ready selector that restricts the choices.
-        goals: of the hierarchy, as a skill that has goals.
-    """
-    if guide is not None and guide.decides:
-        selector, guide = guide.selector, None
-    inside = tuple(_skill(skills, i) for i in range(len(skills.skills)))
-    return Hierarchy(
-        None if selector is None else selects(selector, "the selector's act()"),
-        inside,
-        lengths=skills.lengths,
-        guide=guide and replace(guide, selector=selects(guide.selector, "the guide")),
-        interruption=skills.interruption,
-        fresh_calls=goals is not None,
-        greedy=skills.greedy,
-        greedy_selector=skills.greedy_selector,
-        ask=ask,
-    )
 
 
 def within(policy: Policy) -> Hierarchy:

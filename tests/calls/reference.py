@@ -259,6 +259,8 @@ class Life:
         self.net = None if level.ready else Chooser(level)
         self.memory = {} if self.net is None else self.net.start(1)
         self.decision: Decision | None = None
+        self.once = False
+        """Its selector is asked once for each call."""
 
     @property
     def running(self) -> WorldSkill:
@@ -289,7 +291,7 @@ class Life:
                 may = [k in wanted for k in range(len(may))]
         mask = [yes for yes in may for _ in self.lengths]
         greedy = deterministic and self.level.greedy_selector
-        asks = self.net is not None and self.choices is None and self.course.learns != "outside"
+        asks = self.net is not None and self.choices is None and not self.once
         again = asks and (self.learns or not greedy)
         before, tried = self.memory, list[int]()
         while True:
@@ -558,7 +560,9 @@ def episode(
     rests = resting("zero", ACTIONS[world.level.kind], None)
     course = Course(learns, rests, Counter() if seen is None else seen)
     choices = None if choices is None else choices[::-1]
-    return [*lived(Life(world.level, course, learns in ("first", "all"), choices), world, seed)]
+    life = Life(world.level, course, learns in ("first", "all"), choices)
+    life.once = learns == "outside"
+    return [*lived(life, world, seed)]
 
 
 def lived(life: Life, world: World, seed: int) -> Iterator[Moment]:

@@ -19,7 +19,7 @@ from skillweave.policies.core import INTERRUPTED, RUNNING, Policy
 from skillweave.policies.hierarchy import CalledSkill, Hierarchy, Interruption
 from skillweave.skills.goal_spaces import draw_from, with_goal
 from skillweave.skills.goals import goals_of
-from skillweave.skills.skill_set import SkillSet, hierarchy_of
+from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Step
 
 TOGETHER: Any = {"selector": SELECTOR, "learn": "together", "train_defaults": OFTEN}
@@ -81,7 +81,7 @@ def test_a_call_is_cut_for_its_goal():
     )
     assert policy.observation_space == space
     skills = SkillSet((skill,), (policy,), interruption=Interruption(worth, 0.2))
-    policy = hierarchy_of(skills)
+    policy = skills.hierarchy
     memory, rows = policy.start(3), np.arange(3)
     goals = np.float32([[-0.9, 0], [-0.1, 0], [0.9, 0]])  # 0 is worth 0.9, 0.1 and -0.9 more
     policy.begin(memory, rows, np.zeros(3, int), {0: goals})

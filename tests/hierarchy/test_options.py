@@ -17,7 +17,7 @@ from skillweave.errors import SkillError, SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.skills.skill_set import SkillSet, hierarchy_of
+from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Step
 
 torch.set_num_threads(1)
@@ -365,4 +365,4 @@ def test_a_memory_that_no_checkpoint_could_hold_is_refused_by_the_skills_name():
 
     skills = SkillSet((Left(),), (Wordy(),), (), 5)
     with pytest.raises(SkillweaveError, match="skill 'left': its policy remembers 'said' as obj"):
-        hierarchy_of(skills)
+        _ = skills.hierarchy
