@@ -165,28 +165,6 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     assert report.metrics["samples"].tolist() == [T * B]
 
 
-def test_greedy_is_the_most_probable_action_and_the_mean():
-    obs = torch.randn(2, 7, 3, generator=torch.Generator().manual_seed(0))
-    for space, greedy in (
-        (Discrete(4), lambda head: head.argmax(-1)),
-        (Box(-1, 1, (2,)), lambda h: h),
-    ):
-        algorithm, state = make(space, members=2)
-        action, head, _ = algorithm.act(algorithm.acting_params(state), obs, None, None)
-        assert torch.equal(action, greedy(head))
-
-
-def test_sampling_follows_the_heads_distribution():
-    algorithm, state = make()
-    algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([0.0, 1.0, 2.0, 3.0])
-    noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
-    action, head, _ = algorithm.act(
-        algorithm.acting_params(state), torch.zeros(1, 50_000, 3), None, noise
-    )
-    frequency = action.flatten().bincount(minlength=4) / 50_000
-    torch.testing.assert_close(frequency, head[0, 0].softmax(-1), atol=0.008, rtol=0)
-
-
 def test_continuous_sampling_has_the_initial_deviation():
     algorithm, state = make(Box(-1, 1, (2,)), action_std_init=0.3)
     noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]

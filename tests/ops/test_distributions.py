@@ -2,14 +2,11 @@ import math
 
 import pytest
 import torch
-from torch.distributions import Categorical, Normal
 
 from skillweave.ops.distributions import (
-    categorical_sample,
     categorical_stats,
     gumbel,
     mask_logits,
-    normal_stats,
     tanh_log_det,
 )
 
@@ -19,24 +16,6 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-def test_categorical_log_prob_and_entropy_agree_with_torch(generator):
-    logits = 3.0 * torch.randn(2, 5, 4, generator=generator)
-    action = torch.randint(4, (2, 5), generator=generator)
-    log_prob, entropy = categorical_stats(logits, action)
-    reference = Categorical(logits=logits)
-    torch.testing.assert_close(log_prob, reference.log_prob(action))
-    torch.testing.assert_close(entropy, reference.entropy())
-
-
-def test_normal_log_density_and_entropy_agree_with_torch(generator):
-    mean, action = torch.randn(2, 2, 5, 3, generator=generator)
-    log_std = torch.randn(2, 1, 3, generator=generator)
-    log_prob, entropy = normal_stats(mean, log_std, action)
-    reference = Normal(mean, log_std.exp().expand_as(mean))
-    torch.testing.assert_close(log_prob, reference.log_prob(action).sum(-1))
-    torch.testing.assert_close(entropy, reference.entropy().sum(-1))
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_gumbel_noise_is_finite_at_both_ends_and_rises_with_the_uniform(dtype):
     u = torch.tensor([0.0, 1e-30, 0.3, 0.5, 1.0 - 2.0**-24], dtype=dtype)
@@ -44,21 +23,6 @@ def test_gumbel_noise_is_finite_at_both_ends_and_rises_with_the_uniform(dtype):
     assert torch.isfinite(noise).all()
     assert (noise.diff() >= 0).all()
     assert noise[3].item() == pytest.approx(-math.log(math.log(2.0)))
-
-
-def test_gumbel_sampling_frequencies_are_the_softmax(generator):
-    logits = torch.tensor([0.0, 1.0, 2.0, -1.0])
-    action = categorical_sample(logits, gumbel(torch.rand(100_000, 4, generator=generator)))
-    frequency = action.bincount(minlength=4) / len(action)
-    torch.testing.assert_close(frequency, logits.softmax(-1), atol=0.006, rtol=0)
-
-
-def test_masking_leaves_the_others_as_a_smaller_categorical():
-    logits, mask = torch.tensor([[5.0, 0.0, 1.0]]), torch.tensor([[False, True, True]])
-    log_prob, entropy = categorical_stats(mask_logits(logits, mask), torch.tensor([2]))
-    reference = Categorical(logits=logits[:, 1:])
-    torch.testing.assert_close(log_prob, reference.log_prob(torch.tensor([1])))
-    torch.testing.assert_close(entropy, reference.entropy())
 
 
 def test_masked_logits_get_no_gradient_and_the_others_a_finite_one():
