@@ -17,7 +17,7 @@ import torch
 
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.batches import Sample
+from skillweave.algorithms.batches import Rollout, Sample
 from skillweave.algorithms.config import PPO, AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.envs.engine import RawStep
@@ -620,6 +620,52 @@ def random_critic(algorithm: Any, state: Any) -> None:
     weight = algorithm.layout.views(state.params)[f"{algorithm.critic_net.head}.weight"]
     drawn = torch.randn(weight.shape[1:], generator=torch.Generator().manual_seed(0))
     weight.copy_(drawn / len(drawn) ** 0.5)
+
+
+def rollout_of(
+    algorithm: Any,
+    state: Any,
+    seed: int = 0,
+    steps: int = 8,
+    columns: int = 6,
+    *,
+    around: float = 2.0,
+    masked: bool = False,
+    **more: Any,
+) -> Rollout:
+    """Random trajectories that hang together, acted on by PPO's members, after any memory."""
+    g, p = torch.Generator().manual_seed(seed), len(state.params)
+    lead, width = (p, steps, columns), algorithm.obs.size
+    last = torch.rand(lead, generator=g) < 0.2
+    terminated = last & (torch.rand(lead, generator=g) < 0.5)
+    last[:, -1] = True
+    obs = around + torch.randn(*lead, width, generator=g)
+    next_obs = torch.randn(*lead, width, generator=g)
+    next_obs[:, :-1] = torch.where(last[:, :-1, :, None], next_obs[:, :-1], obs[:, 1:])
+    mask = None
+    if masked:
+        mask = torch.rand(*lead, algorithm.codec.size, generator=g) < 0.5
+        mask[..., 2] = True
+    starts = torch.zeros_like(last)
+    starts[:, 1:] = last[:, :-1]
+    size, acted = algorithm.memory_size, []
+    memory = first = torch.randn(p, columns, size, generator=g) if size else None
+    params = algorithm.acting_params(state, 0.0)
+    chance = [torch.Generator().manual_seed(100 * seed + m) for m in range(p)]
+    noise = algorithm.noise(chance, steps, columns)
+    for t in range(steps):
+        allowed = None if mask is None else mask[:, t]
+        if memory is not None:
+            memory = torch.where(starts[:, t, :, None], 0.0, memory)
+        *found, memory = algorithm.act(params, obs[:, t], allowed, noise[t], memory)
+        acted.append(found)
+    action, dist_params = (torch.stack(x, 1) for x in zip(*acted, strict=True))
+    log_std = params.views.get("actor.log_std")
+    return Rollout(
+        obs, action, torch.randn(lead, generator=g), 0.9 * ~terminated, next_obs, last, mask,
+        dist_params=dist_params, log_std=None if log_std is None else log_std[:, None],
+        recurrent_state=first, episode_start=starts if size else None, **more,
+    )  # fmt: skip
 
 
 def transitions(

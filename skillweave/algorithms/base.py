@@ -376,6 +376,7 @@ class Algorithm:
         """Take one step of Adam on ``state.params``; return the unclipped gradient norm, (P,).
 
         Args:
+            state: of P members.
             loss: (P,), of ``leaves``.
             leaves: of ``layout``.
             rate: (P,), the learning rate.

@@ -290,7 +290,9 @@ def _wrappers(env: gym.Env[Any, Any]) -> Iterator[gym.Wrapper[Any, Any, Any, Any
 def _drawn_spaces(env: gym.Env[Any, Any]) -> list[gym.Space[Any]]:
     """Return the spaces from which an environment and its wrappers may draw.
 
-    A space that stands in a class is copied, so that each environment draws from its own.
+    A space that stands in a class is copied, so that each environment draws from its own. The copy
+    becomes an attribute of the environment, whose code draws by ``self.action_space``: to exchange
+    the generator of the class's space around each call would change an object of all environments.
     """
     by_id: dict[int, gym.Space[Any]] = {}
     for layer in (env.unwrapped, *_wrappers(env)):

@@ -71,7 +71,7 @@ def opened(
     kept: Mapping[str, Array],
     obs: Array,
     observation_space: gym.Space[Any],
-    goals: Mapping[str, Goals] | None = None,
+    goals: Mapping[str, Goals],
 ) -> Memory:
     """Return the open calls of a checkpoint, copied; observations as the environments have them.
 
@@ -88,7 +88,7 @@ def opened(
     for name, value in open_calls.items():
         if name_of(name) == "obs":  # of a hierarchy below: "inner/obs"
             like, codec = obs, plain
-            if (own := (goals or {}).get(name)) is not None:
+            if (own := goals.get(name)) is not None:
                 like = own.join(obs, own.start(len(obs)))
                 codec = obs_codec(with_goal(observation_space, own.goal_space))
             found[name] = value.copy().view(like.dtype).reshape(like.shape)

@@ -170,35 +170,11 @@ def test_noisy_weights_explore_and_nothing_else_does():
     assert torch.equal(means, algorithm.act(actor, obs, None, (noises[0][0], None))[0])
 
 
-def test_an_update_with_noisy_weights_draws_noise_of_each_members_own():
-    algorithm, state = make(noisy=True, network=Network((4,)))
-    one = make(noisy=True, network=Network((4,)))[1]
-    algorithm.update(state, sample(), [Seeds(m).torch() for m in range(P)])
-    algorithm.update(one, sample(), [Seeds(0).torch(), Seeds(7).torch()])
-    assert torch.equal(state.params[0], one.params[0])
-    assert not torch.equal(state.params[1], one.params[1])
-
-
 def test_rainbow_has_every_extension_and_settings_override():
     config = DQN.rainbow(n_step=5)
     assert (config.n_step, config.adam_eps) == (5, 1.5e-4)
     for name in ("double", "dueling", "noisy", "distributional", "prioritized"):
         assert getattr(config, name) is True
-
-
-def test_a_masked_action_is_not_taken_however_good_it_looks():
-    algorithm, state = make()
-    state.params[:] = 0.0
-    algorithm.layout.views(state.params)["q.0.bias"][:] = torch.tensor([9.0, 0.0, 1.0])
-    mask = torch.tensor([False, True, True]).expand(P, 2000, A)
-    obs = torch.zeros(P, 2000, 2)
-    for progress in (0.0, 1.0):
-        actor = algorithm.acting_params(state, progress)
-        for noise in (algorithm.noise([Seeds(m).torch() for m in range(P)], 1, 2000)[0], None):
-            action, _, _ = algorithm.act(actor, obs, mask, noise)
-            assert (action != 0).all()
-            if noise is None:
-                assert (action == 2).all()
 
 
 # The atoms

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
-from toys import members_of, random_critic
+from toys import members_of, random_critic, rollout_of
 
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.batches import Batch, Rollout
@@ -39,26 +39,9 @@ def made(config: PPO, members: int) -> tuple[PPOAlgorithm, State]:
     return algorithm, state
 
 
-def full(algorithm: PPOAlgorithm, members: int, steps: int = T, columns: int = B) -> Rollout:
+def full(algorithm: PPOAlgorithm, state: State) -> Rollout:
     """Trajectories that hang together, without gaps."""
-    g, lead = torch.Generator().manual_seed(3), (members, steps, columns)
-    terminated = torch.rand(lead, generator=g) < 0.2
-    last = terminated | (torch.rand(lead, generator=g) < 0.2)
-    last[:, -1] = True
-    obs, next_obs = (1.0 + 2.0 * torch.randn(*lead, OBS, generator=g) for _ in range(2))
-    next_obs[:, :-1] = torch.where(last[:, :-1, :, None], next_obs[:, :-1], obs[:, 1:])
-    mask = torch.rand(*lead, ACTIONS, generator=g) < 0.6
-    mask[..., 0] = True
-    starts = torch.zeros_like(last)
-    starts[:, 1:] = last[:, :-1]
-    memory = torch.randn(members, columns, algorithm.memory_size, generator=g)
-    return Rollout(
-        obs, torch.zeros(lead, dtype=torch.int64), torch.randn(lead, generator=g),
-        0.9 * ~terminated, next_obs, last, mask,
-        dist_params=torch.randn(*lead, ACTIONS, generator=g),
-        recurrent_state=memory if algorithm.memory_size else None,
-        episode_start=starts if algorithm.memory_size else None,
-    )  # fmt: skip
+    return rollout_of(algorithm, state, 3, T, B, masked=True)
 
 
 def with_gaps(rollout: Rollout, seed: int = 0, more: int = 5) -> Rollout:
@@ -128,7 +111,7 @@ def assert_alike(one: State, other: State, exactly: bool = False) -> None:
 @pytest.mark.parametrize("config", [CONFIG, RECURRENT], ids=["mlp", "gru"])
 def test_a_rollout_with_gaps_is_learnt_from_as_the_full_one_with_the_same_rows(config):
     algorithm, state = made(config, 2)
-    rollout = full(algorithm, 2)
+    rollout = full(algorithm, state)
     there, report = learnt(algorithm, members_of(state, slice(0, 2)), rollout)
     here, other = learnt(algorithm, members_of(state, slice(0, 2)), with_gaps(rollout))
     assert not torch.equal(there.params, state.params)
@@ -143,7 +126,7 @@ def test_a_rollout_with_gaps_is_learnt_from_as_the_full_one_with_the_same_rows(c
 def test_columns_of_different_lengths_are_learnt_from_row_by_row(config):
     # Column 0 after column 1, in one column: the same rows, as all of them are one minibatch.
     algorithm, state = made(replace(config, batch_size=T * B, update_epochs=3), 1)
-    rollout = full(algorithm, 1)
+    rollout = full(algorithm, state)
     if rollout.recurrent_state is not None and rollout.episode_start is not None:
         rollout.recurrent_state[:, 0] = 0.0
         rollout.episode_start[:, 0, 0] = True
@@ -162,7 +145,7 @@ def test_columns_of_different_lengths_are_learnt_from_row_by_row(config):
 
 def test_networks_without_memory_run_on_valid_rows_alone(monkeypatch):
     algorithm, state = made(CONFIG, 1)
-    rollout, seen = with_gaps(full(algorithm, 1), more=40), []
+    rollout, seen = with_gaps(full(algorithm, state), more=40), []
     run = type(algorithm.critic_net).__call__
 
     def counted(net: Any, views: Any, inputs: Any, extra: Any = None) -> Any:
@@ -177,7 +160,7 @@ def test_networks_without_memory_run_on_valid_rows_alone(monkeypatch):
 @pytest.mark.parametrize("config", [CONFIG, RECURRENT], ids=["mlp", "gru"])
 def test_a_stack_with_gaps_learns_what_its_members_learn_alone(config):
     algorithm, state = made(config, 3)
-    rollout = with_gaps(full(algorithm, 3))
+    rollout = with_gaps(full(algorithm, state))
     rollout.valid[:, 2, 1] = rollout.valid[:, 5, 1] = False  # as many of each member, or nearly
     rollout.last |= rollout.valid  # so that a row may be missing between two others
     equal = int(rollout.valid.flatten(1).sum(1).min())
@@ -198,7 +181,7 @@ def test_a_stack_with_gaps_learns_what_its_members_learn_alone(config):
 @pytest.mark.parametrize("config", [CONFIG, RECURRENT], ids=["mlp", "gru"])
 def test_members_with_fewer_rows_are_padded_with_rows_that_do_not_count(config):
     algorithm, state = made(replace(config, batch_size=T * B, update_epochs=3), 2)
-    rollout = with_gaps(full(algorithm, 2))
+    rollout = with_gaps(full(algorithm, state))
     rollout.valid[1, :, 2:] = False
     stack, report = learnt(algorithm, members_of(state, slice(0, 2)), rollout)
     assert report.metrics["samples"].tolist() == [T * B, T * 2]
@@ -213,7 +196,7 @@ def test_members_with_fewer_rows_are_padded_with_rows_that_do_not_count(config):
 @pytest.mark.parametrize("config", [CONFIG, RECURRENT], ids=["mlp", "gru"])
 def test_a_member_without_rows_stays_as_it_is(config):
     algorithm, state = made(config, 2)
-    rollout, before = with_gaps(full(algorithm, 2)), members_of(state, slice(0, 2))
+    rollout, before = with_gaps(full(algorithm, state)), members_of(state, slice(0, 2))
     rollout.valid[0] = False
     after, report = learnt(algorithm, state, rollout)
     for name in ("params", "mu", "nu", "count", "obs_mean", "obs_var", "return_mean"):

@@ -17,6 +17,7 @@ from skillweave.algorithms.config import (
     PPO,
     SAC,
     TD3,
+    SelfImitationPPO,
     config_from_json,
     config_to_json,
 )
@@ -24,8 +25,6 @@ from skillweave.algorithms.parameters import LARGEST
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.errors import DeclarationError, RunError
 from skillweave.networks.config import CNN, RNN, Network
-from skillweave.ops.losses import weighted_mean
-from skillweave.ops.returns import td_target
 from skillweave.spaces import obs_codec
 
 NAN = float("nan")
@@ -58,6 +57,7 @@ def test_settings_that_do_not_fit_each_other_are_named(kind, name, value, asked)
         TD3.ddpg(critic=Network((8,), "relu", True)),
         SAC(target_entropy=-3.0, network=Network(cnn=CNN.impala((4,)))),
         PPO(network=Network(rnn=RNN("gru", 5), encoder="mine", cnn=CNN.small())),
+        SelfImitationPPO(imitation_rows=5, target_kl=0.1, critic=Network((8,), "relu", True)),
     ],
     ids=lambda c: type(c).__name__,
 )
@@ -103,18 +103,6 @@ def test_the_rate_is_constant_or_falls_to_nothing():
         state = algorithm.init([Seeds(0)])
         found = [algorithm.rate(state, p).item() for p in (0.0, 0.5, 1.0)]
         assert found == pytest.approx(rates)
-
-
-def test_what_follows_an_end_may_be_anything():
-    reward, discount = torch.tensor([[1.0, 2.0]]), torch.tensor([[0.0, 0.5]])
-    target = td_target(reward, discount, torch.tensor([[NAN, 8.0]]))
-    assert target.tolist() == [[1.0, 6.0]]
-
-
-def test_weights_of_prioritised_replay_count():
-    loss, weight = torch.tensor([[1.0, 3.0]]), torch.tensor([[1.0, 0.5]])
-    assert weighted_mean(loss, None).tolist() == [2.0]
-    assert weighted_mean(loss, weight).tolist() == [1.25]
 
 
 def test_critics_of_a_member_differ_and_do_not_depend_on_its_neighbours():

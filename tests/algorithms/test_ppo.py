@@ -5,14 +5,11 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 from torch import nn
-from toys import Echo, learn, members_of, random_critic, training
+from toys import Echo, learn, members_of, random_critic, rollout_of, training
 
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.batches import Rollout
 from skillweave.algorithms.config import (
     PPO,
-    config_from_json,
-    config_to_json,
 )
 from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.networks.config import RNN, Network
@@ -39,39 +36,14 @@ def rngs(*seeds: int | Seeds) -> list[torch.Generator]:
     return [(s if isinstance(s, Seeds) else Seeds(s)).torch() for s in seeds]
 
 
-def rollout(algorithm: PPOAlgorithm, state: State, seed: int = 0, masked: bool = False) -> Rollout:
-    """Random trajectories that hang together, acted on by the state's policy."""
-    g, p = torch.Generator().manual_seed(seed), len(state.params)
-    last = torch.rand(p, T, B, generator=g) < 0.2
-    terminated = last & (torch.rand(p, T, B, generator=g) < 0.5)
-    last[:, -1] = True
-    obs = 2.0 + torch.randn(p, T, B, 3, generator=g)
-    next_obs = torch.randn(p, T, B, 3, generator=g)
-    next_obs[:, :-1] = torch.where(last[:, :-1, :, None], next_obs[:, :-1], obs[:, 1:])
-    mask = None
-    if masked:
-        mask = torch.rand(p, T, B, 4, generator=g) < 0.5
-        mask[..., 2] = True
-    actor = algorithm.acting_params(state)
-    noise = algorithm.noise([torch.Generator().manual_seed(m) for m in range(p)], T * B, 1)
-    flat_mask = None if mask is None else mask.flatten(1, 2)
-    action, head, _ = algorithm.act(
-        actor, obs.flatten(1, 2), flat_mask, noise[:, :, 0].transpose(0, 1)
-    )
-    log_std = actor.views.get("actor.log_std")
-    return Rollout(
-        obs, action.unflatten(1, (T, B)), torch.randn(p, T, B, generator=g),
-        0.9 * (~terminated), next_obs, last, mask, dist_params=head.unflatten(1, (T, B)),
-        log_std=None if log_std is None else log_std[:, None],
-    )  # fmt: skip
-
-
 def updated(
     algorithm: PPOAlgorithm, state: State, updates: int = 3, members=range(1), **kwargs
 ) -> State:
     """Several updates on data that depends on the member's number alone."""
     for u in range(updates):
-        whole = rollout(algorithm, algorithm.init([Seeds(m) for m in range(3)]), seed=u, **kwargs)
+        whole = rollout_of(
+            algorithm, algorithm.init([Seeds(m) for m in range(3)]), seed=u, **kwargs
+        )
         mine = members_of(whole, slice(members.start, members.stop))
         mine.progress = u / updates
         state, _ = algorithm.update(state, mine, rngs(*(Seeds(9) / m / u for m in members)))
@@ -121,24 +93,6 @@ def test_a_stack_of_three_learns_what_three_single_members_learn(variant):
     assert not torch.allclose(stack.params[0], stack.params[1], atol=1e-2)
 
 
-def test_init_does_not_depend_on_the_neighbours():
-    algorithm, _ = make()
-    three = algorithm.init([Seeds(m) for m in range(3)])
-    for m in range(3):
-        assert torch.equal(algorithm.init([Seeds(m)]).params[0], three.params[m])
-    assert not torch.equal(three.params[0], three.params[1])
-
-
-def test_the_same_seed_gives_the_same_weights_bit_for_bit_and_another_does_not():
-    def weights(seed: int) -> torch.Tensor:
-        algorithm, state = make()
-        data = rollout(algorithm, state)
-        return algorithm.update(state, data, rngs(seed))[0].params
-
-    assert torch.equal(weights(1), weights(1))
-    assert not torch.equal(weights(1), weights(2))  # the order of the minibatches
-
-
 def plain_network(algorithm: PPOAlgorithm, state: State, prefix: str) -> nn.Sequential:
     views = algorithm.layout.views(state.params)
     layers: list[nn.Module] = []
@@ -161,7 +115,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     settings = {"batch_size": T * B, "normalize_returns": False, "ent_coef": 0.1, "clip_coef": 0.01}
     algorithm, state = make(space, **settings)
     cfg = algorithm.config
-    data = rollout(algorithm, state, masked=masked)
+    data = rollout_of(algorithm, state, masked=masked)
     tr = data
     acted, _ = algorithm.head.stats(data.dist_params, data.log_std, tr.mask, tr.action)
     if late:  # what learns is no longer what acted
@@ -211,28 +165,6 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     assert report.metrics["samples"].tolist() == [T * B]
 
 
-def test_greedy_is_the_most_probable_action_and_the_mean():
-    obs = torch.randn(2, 7, 3, generator=torch.Generator().manual_seed(0))
-    for space, greedy in (
-        (Discrete(4), lambda head: head.argmax(-1)),
-        (Box(-1, 1, (2,)), lambda h: h),
-    ):
-        algorithm, state = make(space, members=2)
-        action, head, _ = algorithm.act(algorithm.acting_params(state), obs, None, None)
-        assert torch.equal(action, greedy(head))
-
-
-def test_sampling_follows_the_heads_distribution():
-    algorithm, state = make()
-    algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([0.0, 1.0, 2.0, 3.0])
-    noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
-    action, head, _ = algorithm.act(
-        algorithm.acting_params(state), torch.zeros(1, 50_000, 3), None, noise
-    )
-    frequency = action.flatten().bincount(minlength=4) / 50_000
-    torch.testing.assert_close(frequency, head[0, 0].softmax(-1), atol=0.008, rtol=0)
-
-
 def test_continuous_sampling_has_the_initial_deviation():
     algorithm, state = make(Box(-1, 1, (2,)), action_std_init=0.3)
     noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
@@ -252,10 +184,10 @@ def test_without_an_entropy_bonus_a_fresh_policy_does_not_move_until_something_i
     state = algorithm.init([Seeds(0)])
     before = state.params.clone()
     for i in range(3):
-        data = replace(rollout(algorithm, state, i), reward=torch.zeros(1, T, B))
+        data = replace(rollout_of(algorithm, state, i), reward=torch.zeros(1, T, B))
         state, _ = algorithm.update(state, data, rngs(i))
     assert torch.equal(state.params, before)
-    state, _ = algorithm.update(state, rollout(algorithm, state, 3), rngs(3))
+    state, _ = algorithm.update(state, rollout_of(algorithm, state, 3), rngs(3))
     assert not torch.equal(state.params, before)
 
 
@@ -266,7 +198,7 @@ def test_where_nothing_is_paid_the_entropy_bonus_does_not_widen_the_deviation_fo
         Box(-1, 1, (2,)), ent_coef=0.1, learning_rate=0.02, action_std=action_std
     )
     for i in range(60):
-        data = replace(rollout(algorithm, state, i), reward=torch.zeros(1, T, B))
+        data = replace(rollout_of(algorithm, state, i), reward=torch.zeros(1, T, B))
         state, _ = algorithm.update(state, data, rngs(i))
     head = algorithm.act(algorithm.acting_params(state), torch.full((1, 1, 3), 2.0), None, None)[1]
     log_std = algorithm.layout.views(state.params).get("actor.log_std")
@@ -286,22 +218,12 @@ def test_a_masked_action_is_never_taken_and_has_no_probability():
         assert (head.softmax(-1)[~mask] == 0).all()
 
 
-def test_each_member_has_its_own_noise():
-    algorithm, _ = make()
-    seeds = [Seeds(0) / m for m in range(3)]
-    three = algorithm.noise([s.torch() for s in seeds], 5, 2)
-    assert three.shape == (5, 3, 2, 4)
-    for m, s in enumerate(seeds):
-        assert torch.equal(algorithm.noise([s.torch()], 5, 2)[:, 0], three[:, m])
-    assert not torch.equal(three[:, 0], three[:, 1])
-
-
 @pytest.mark.parametrize("normalize_obs", [False, True])
 def test_an_actor_is_a_copy_that_learning_does_not_change(normalize_obs):
     algorithm, state = make(normalize_obs=normalize_obs)
     actor, obs = algorithm.acting_params(state), torch.randn(1, 5, 3)
     before = algorithm.act(actor, obs, None, None)[1].clone()
-    algorithm.update(state, rollout(algorithm, state), rngs(0))
+    algorithm.update(state, rollout_of(algorithm, state), rngs(0))
     assert torch.equal(algorithm.act(actor, obs, None, None)[1], before)
     assert not torch.equal(
         algorithm.act(algorithm.acting_params(state), obs, None, None)[1], before
@@ -310,7 +232,7 @@ def test_an_actor_is_a_copy_that_learning_does_not_change(normalize_obs):
 
 def test_observations_are_normalised_by_all_that_were_seen():
     algorithm, state = make(normalize_obs=True)
-    data = [rollout(algorithm, state, seed=s) for s in range(2)]
+    data = [rollout_of(algorithm, state, seed=s) for s in range(2)]
     for d in data:
         algorithm.update(state, d, rngs(0))
     seen = torch.cat([d.obs.flatten(0, 2) for d in data])
@@ -321,14 +243,14 @@ def test_observations_are_normalised_by_all_that_were_seen():
 def test_a_member_that_oversteps_the_kl_stops_and_the_others_go_on():
     algorithm, state = make(members=2, target_kl=0.01, update_epochs=10)
     state.learning_rate = torch.tensor([0.05, 1e-5])
-    algorithm.update(state, rollout(algorithm, state), rngs(0, 1))
+    algorithm.update(state, rollout_of(algorithm, state), rngs(0, 1))
     assert 0 < state.count[0] < 30
     assert state.count[1] == 30
 
 
 def test_metrics_of_an_update_that_stops_early_are_means_over_the_steps_it_took():
     algorithm, state = make(target_kl=1e-4, update_epochs=10, learning_rate=1e-2)
-    _, report = algorithm.update(state, rollout(algorithm, state), rngs(0))
+    _, report = algorithm.update(state, rollout_of(algorithm, state), rngs(0))
     assert 0 < state.count.item() < 30
     assert report.metrics["entropy"].item() == pytest.approx(
         np.log(4), rel=0.05
@@ -338,7 +260,7 @@ def test_metrics_of_an_update_that_stops_early_are_means_over_the_steps_it_took(
 @pytest.mark.parametrize("settings", [{}, {"normalize_obs": True}])
 def test_an_update_from_an_old_policy_is_never_empty(settings):
     algorithm, state = make(target_kl=1e-5, learning_rate=0.05, **settings)
-    stale = rollout(algorithm, state)
+    stale = rollout_of(algorithm, state)
     for done in range(1, 4):  # by the second, the policy is another than acted
         before = state.params.clone()
         _, report = algorithm.update(state, stale, rngs(0))
@@ -349,7 +271,7 @@ def test_an_update_from_an_old_policy_is_never_empty(settings):
 
 def test_kl_counts_from_the_first_policy_of_an_update():
     algorithm, state = make(batch_size=T * B, update_epochs=2, learning_rate=0.05)
-    data = rollout(algorithm, state)
+    data = rollout_of(algorithm, state)
     algorithm.layout.views(state.params)["actor.1.bias"] += torch.tensor([0.5, 0.0, -0.5, 0.0])
     tr, heads = data, []
     for epochs in range(2):  # the policies before the first and the second gradient step
@@ -413,7 +335,7 @@ def test_a_rollout_of_any_size_is_learnt_from(columns, steps, asks, rnn):
 
 def test_the_linear_schedule_falls_to_nothing():
     algorithm, state = make(learning_rate_schedule="linear")
-    data, before = rollout(algorithm, state), state.params.clone()
+    data, before = rollout_of(algorithm, state), state.params.clone()
     _, report = algorithm.update(state, replace(data, progress=1.0), rngs(0))
     assert torch.equal(state.params, before)
     _, report = algorithm.update(state, replace(data, progress=0.75), rngs(0))
@@ -424,25 +346,15 @@ def test_the_linear_schedule_falls_to_nothing():
 def test_the_kl_schedule_speeds_a_timid_member_up_and_slows_a_bold_one_down():
     algorithm, state = make(members=2, learning_rate_schedule="kl", target_kl=1e-3)
     state.learning_rate = torch.tensor([2e-5, 9e-3])
-    algorithm.update(state, rollout(algorithm, state), rngs(0, 1))
+    algorithm.update(state, rollout_of(algorithm, state), rngs(0, 1))
     torch.testing.assert_close(state.learning_rate, torch.tensor([3e-5, 6e-3]))
 
 
 def test_a_terminal_observation_that_is_not_finite_does_no_harm():
     algorithm, state = make()
-    data = rollout(algorithm, state)
+    data = rollout_of(algorithm, state)
     ends = data.discount == 0
     assert ends.any()
     data.next_obs[ends] = float("nan")
     algorithm.update(state, data, rngs(0))
     assert torch.isfinite(state.params).all()
-
-
-def test_a_small_rollout_needs_no_batch_size_of_its_own():
-    assert PPO(num_envs=4, n_steps=4).batch_size == PPO().batch_size
-
-
-def test_settings_survive_json():
-    config = replace(CONFIG, critic=Network((8,), "relu", True), target_kl=0.1)
-    assert config_from_json(config_to_json(config)) == config
-    assert config_from_json(config_to_json(PPO())) == PPO()

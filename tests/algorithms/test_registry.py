@@ -11,17 +11,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from toys import Countdown, Echo, Masked, learn, own_algorithm as example
+from toys import own_algorithm as example
 
 from skillweave import PPO, SAC, Apart, Hierarchy, Network, Skill, train_agent
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import Algorithm, config as table, register_algorithm
 from skillweave.algorithms.config import OnPolicy, config_from_json, config_to_json, named_config
-from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution import Evolution, Mutations
-from skillweave.runs.files import read_tensors, record_in, write_tensors
 
 BOX, LINE = gym.spaces.Box(-1, 1, (2,), np.float32), gym.spaces.Discrete(2)
 
@@ -42,33 +40,6 @@ def own(**settings: Any) -> Any:
 
 
 # Learning
-
-
-@pytest.mark.fast_cases(1)
-@pytest.mark.parametrize(("asks", "updates"), [("Discrete", 120), ("Box", 400)])
-def test_it_learns_to_answer_what_it_sees_and_its_file_acts_the_same(asks, updates, tmp_path):
-    env = Echo(8, "vector", asks)
-    algorithm, state = learn(own(learning_rate=1e-2), env, 64 * updates)
-    policy, shown = AgentPolicy.of(algorithm, state), np.arange(4)
-    action, _ = policy.act({}, env.show(shown))
-    assert env.error(shown, action).mean() < 0.1
-    write_tensors(tmp_path / "agent", *policy.to_file())
-    tensors, header = read_tensors(tmp_path / "agent")
-    loaded = AgentPolicy.from_file(tensors, record_in(AgentHeader, header, "agent"), "agent")
-    assert np.array_equal(loaded.act({}, env.show(shown))[0], action)
-
-
-@pytest.mark.slow
-def test_its_values_are_those_of_the_ends_that_it_meets():
-    algorithm, state = learn(own(), Countdown(8), 64 * 150)
-    found = algorithm.value(state, torch.arange(5)[None])[0].tolist()
-    assert found == pytest.approx([sum(0.5**i for i in range(5 - t)) for t in range(5)], rel=0.1)
-
-
-def test_it_never_takes_a_forbidden_action():
-    env = Masked(8)
-    learn(own(), env, 64 * 10)
-    assert env.taken_though_forbidden == 0
 
 
 def test_a_stack_of_it_learns_what_its_members_learn_alone():

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from toys import rollout_of
 
 from skillweave import PPO, RNN, Network
 from skillweave._internal.seeding import Seeds
@@ -19,33 +20,6 @@ SEEN = gym.spaces.Box(-1, 1, (3,), np.float32)
 LINE, FORCE = gym.spaces.Discrete(4), gym.spaces.Box(-1, 1, (2,), np.float32)
 PLAIN, GRU = Network((8,)), Network((8,), rnn=RNN("gru", 4))
 LEAD = T, B = 8, 4
-
-
-def acted(algorithm, state, seed=0):
-    """A rollout (1, T, B) in which the policy acted, after a memory of chance."""
-    rng = torch.Generator().manual_seed(seed)
-    obs, memory = torch.randn(1, T, B, 3, generator=rng), None
-    if algorithm.memory_size:
-        memory = torch.randn(1, B, algorithm.memory_size, generator=rng)
-    starts = torch.zeros(1, T, B, dtype=torch.bool)
-    starts[:, 3, 1] = True
-    params, actions, heads, now = algorithm.acting_params(state), [], [], memory
-    for t in range(T):
-        now = None if now is None else torch.where(starts[:, t, :, None], 0.0, now)
-        noise = algorithm.noise([rng], 1, B)[0]
-        action, head, now = algorithm.act(params, obs[:, t], None, noise, now)
-        actions.append(action)
-        heads.append(head)
-    log_std = params.views.get("actor.log_std")
-    last = torch.zeros(1, T, B, dtype=torch.bool)
-    last[:, -1] = last[:, 2, 1] = True
-    return Rollout(
-        obs=obs, action=torch.stack(actions, 1), dist_params=torch.stack(heads, 1),
-        reward=torch.randn(1, T, B, generator=rng), discount=torch.full((1, T, B), 0.9),
-        next_obs=torch.randn(1, T, B, 3, generator=rng), last=last, recurrent_state=memory,
-        episode_start=None if memory is None else starts,
-        log_std=None if log_std is None else log_std[:, None],
-    )  # fmt: skip
 
 
 def made(space=LINE, network=PLAIN, **more):
@@ -67,7 +41,7 @@ CASES = [(LINE, PLAIN), (FORCE, PLAIN), (LINE, GRU)]
 @pytest.mark.parametrize(("space", "network"), CASES)
 def test_what_a_reflex_did_trains_the_critic_and_not_the_policy(space, network):
     algorithm, state = made(space, network)
-    rollout = acted(algorithm, state)
+    rollout = rollout_of(algorithm, state, 0, T, B)
     overridden = torch.rand(1, T, B, generator=torch.Generator().manual_seed(5)) < 0.4
     rollout.overridden = overridden
     other = replace(rollout, action=rollout.action.clone())
@@ -86,7 +60,7 @@ def test_what_a_reflex_did_trains_the_critic_and_not_the_policy(space, network):
 
 def test_a_policy_whose_actions_are_all_overridden_stays_as_it_is():
     algorithm, state = made()
-    rollout = acted(algorithm, state)
+    rollout = rollout_of(algorithm, state, 0, T, B)
     rollout.overridden = torch.ones(1, T, B, dtype=torch.bool)
     before = algorithm.layout.views(algorithm.init([Seeds(0)]).params)
     after, told = learnt(algorithm, rollout)
@@ -99,7 +73,7 @@ def test_each_rollout_that_was_held_counts_by_the_deviation_it_was_acted_with():
     algorithm, first = made(FORCE, normalize_obs=False)
     second = algorithm.init([Seeds(0)])
     algorithm.layout.views(second.params)["actor.log_std"].sub_(0.7)
-    one, two = acted(algorithm, first), acted(algorithm, second, 1)
+    one, two = rollout_of(algorithm, first, 0, T, B), rollout_of(algorithm, second, 1, T, B)
     both = {
         k: torch.cat([getattr(one, k), getattr(two, k)], 2)
         for k in ("obs", "action", "reward", "discount", "next_obs", "last", "dist_params")
@@ -119,22 +93,23 @@ def test_each_rollout_that_was_held_counts_by_the_deviation_it_was_acted_with():
 @pytest.mark.parametrize(("space", "network"), CASES)
 def test_an_anchor_is_no_distance_from_the_policy_that_it_is_a_copy_of(space, network):
     algorithm, state = made(space, network, update_epochs=1)
-    rollout = acted(algorithm, state)
+    rollout = rollout_of(algorithm, state, 0, T, B)
     rollout.reference = Reference(algorithm.acting_params(state), torch.ones(1))
     samples, _ = algorithm.samples(state, rollout, Terms.of(algorithm.config, state, rollout))
     assert samples.reference.shape[-1] == algorithm.head.width
     torch.testing.assert_close(samples.reference.reshape(1, T, B, -1), rollout.dist_params)
 
 
-@pytest.mark.slow
-def test_an_anchor_keeps_a_policy_with_a_memory_near():
-    algorithm, _ = made(network=GRU, update_epochs=8)
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize(("space", "network"), CASES)
+def test_an_anchor_keeps_a_policy_near(space, network):
+    algorithm, _ = made(space, network, update_epochs=8)
     moved = {}
     for coef in (0.0, 100.0):
         state = algorithm.init([Seeds(0)])
         near = Reference(algorithm.acting_params(state), torch.tensor([coef]))
         for i in range(3):
-            rollout = replace(acted(algorithm, state, i), reference=near)
+            rollout = rollout_of(algorithm, state, i, T, B, reference=near)
             state, report = algorithm.update(state, rollout, [torch.Generator().manual_seed(1)])
         moved[coef] = report.metrics["reference_kl"].item()
     assert moved[100.0] < 0.1 * moved[0.0]

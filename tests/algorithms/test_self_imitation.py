@@ -10,7 +10,6 @@ from gymnasium.spaces import Box, Discrete
 from skillweave import PPO, Network, SelfImitationPPO
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.batches import Rollout
-from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError, RunError
 from skillweave.training.learner import Stack
@@ -191,7 +190,3 @@ def test_memory_is_refused():
 
     with pytest.raises(DeclarationError, match=r"SelfImitationPPO\.network .* without rnn"):
         SelfImitationPPO(network=Network(rnn=RNN("gru", 4)))
-
-
-def test_settings_survive_json():
-    assert config_from_json(config_to_json(CONFIG)) == CONFIG

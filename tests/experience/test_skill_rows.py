@@ -240,24 +240,6 @@ def test_environments_that_search_act_at_random_while_the_others_go_on(collector
 # What the skill sees -------------------------------------------------------------------------
 
 
-def test_a_skills_termination_terminates_and_resets_at_once(collector):
-    class UntilTwo(Skill):
-        max_steps = 2  # on the same step: then the termination counts
-
-        def termination(self, step):
-            return step.next_obs[:, STEP] == 2
-
-    env = collector(skill=UntilTwo())
-    for _ in range(5):
-        assert not step(env, np.zeros(3, np.int64)).batches[""].ended.any()
-        row = step(env, np.zeros(3, np.int64)).batches[""]
-        assert row["terminated"].all()
-        assert not row["truncated"].any()
-        assert (row["next_obs"][0, :, STEP] == 2).all()
-        assert (env.obs[:, STEP] == 0).all()
-    assert (env.obs[:, EPISODE] == 5).all()
-
-
 @pytest.mark.usefixtures("no_trials")
 @pytest.mark.usefixtures("unprobed")
 def test_a_skill_sees_the_whole_step_and_its_reward_replaces_the_tasks(collector):
@@ -294,21 +276,6 @@ def test_a_skill_sees_the_whole_step_and_its_reward_replaces_the_tasks(collector
             assert not len(collected.episodes)
 
 
-@pytest.mark.usefixtures("unprobed")
-def test_elapsed_counts_from_one_in_every_episode(collector):
-    elapsed = []
-
-    class Count(Skill):
-        def reward(self, step):
-            elapsed.append(step.elapsed.copy())
-            return step.reward
-
-    env = collector(skill=Count())
-    for _ in range(20):
-        row = step(env, np.zeros(3, np.int64)).batches[""]
-        assert np.array_equal(elapsed[-1], row["next_obs"][0, :, STEP])
-
-
 def test_a_reflex_overrides_the_action_in_the_environment_and_in_the_skills_eyes(collector):
     class Watch(Skill):
         def reward(self, step):
@@ -326,41 +293,7 @@ def test_a_reflex_overrides_the_action_in_the_environment_and_in_the_skills_eyes
     assert not given.any(), "the policy's own array was written to"
 
 
-def test_a_task_without_a_skill_keeps_its_reward_and_ends(collector):
-    env = collector("sync", "CartPole-v1")
-    row = step(env, np.zeros(3, np.int64)).batches[""]
-    assert row["reward"][0].tolist() == [1.0] * 3
-    assert row.get("mask") is None
-    assert row.get("valid") is None
-    for _ in range(40):
-        episodes = step(env, np.zeros(3, np.int64)).episodes
-        if len(episodes):
-            break
-    total, task, length, success = episodes[0]
-    assert total == length > 5
-    assert np.isnan([task, success]).all()
-
-
 # Where a skill may start ---------------------------------------------------------------------
-
-
-def test_an_episode_of_a_skill_begins_only_where_it_may_start(collector):
-    class FromStepTwo(Skill):
-        max_steps = 1
-
-        def initiation(self, obs):
-            return obs[:, STEP] == 2
-
-    env = collector(skill=FromStepTwo(), acting=lambda n: Choices(n, 3))
-    collected = env.collect(next(requests(120)))
-    experience = collected.batches[""]
-    valid = experience["valid"]
-    assert (experience["obs"][valid][:, STEP] == 2).all()
-    assert (experience["next_obs"][valid][:, STEP] == 3).all(), "no transition but its own"
-    assert experience.ended[valid].all()
-    assert not experience.ended[~valid].any()
-    assert valid.sum(0).min() > 10
-    assert collected.steps == 360
 
 
 class Nowhere(Skill):

@@ -437,8 +437,6 @@ def test_what_is_no_factory_is_a_sentence():
     ):
         with pytest.raises(DeclarationError, match=says):
             make_encoder(Network(encoder=value).encoder, obs_codec(Box(-1.0, 1.0, (4,))))
-    with pytest.raises(DeclarationError, match="give sees or encoder, not both"):
-        Network(encoder=Features, sees=(0,))
 
 
 def test_lists_and_dicts_are_taken_for_what_they_say():

@@ -2,18 +2,11 @@ import math
 
 import pytest
 import torch
-from torch.distributions import Categorical, Normal, TanhTransform, TransformedDistribution
 
 from skillweave.ops.distributions import (
-    categorical_sample,
     categorical_stats,
     gumbel,
     mask_logits,
-    masked_log_probs,
-    normal_stats,
-    smoothed_action,
-    squashed_entropy,
-    squashed_sample,
     tanh_log_det,
 )
 
@@ -23,31 +16,6 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-def test_categorical_log_prob_and_entropy_agree_with_torch(generator):
-    logits = 3.0 * torch.randn(2, 5, 4, generator=generator)
-    action = torch.randint(4, (2, 5), generator=generator)
-    log_prob, entropy = categorical_stats(logits, action)
-    reference = Categorical(logits=logits)
-    torch.testing.assert_close(log_prob, reference.log_prob(action))
-    torch.testing.assert_close(entropy, reference.entropy())
-
-
-def test_normal_log_density_and_entropy_agree_with_torch(generator):
-    mean, action = torch.randn(2, 2, 5, 3, generator=generator)
-    log_std = torch.randn(2, 1, 3, generator=generator)
-    log_prob, entropy = normal_stats(mean, log_std, action)
-    reference = Normal(mean, log_std.exp().expand_as(mean))
-    torch.testing.assert_close(log_prob, reference.log_prob(action).sum(-1))
-    torch.testing.assert_close(entropy, reference.entropy().sum(-1))
-
-
-def test_gumbel_noise_has_gumbels_moments(generator):
-    noise = gumbel(torch.rand(200_000, generator=generator))
-    assert torch.isfinite(noise).all()
-    assert noise.mean().item() == pytest.approx(0.57722, abs=0.01)
-    assert noise.var().item() == pytest.approx(math.pi**2 / 6, rel=0.03)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_gumbel_noise_is_finite_at_both_ends_and_rises_with_the_uniform(dtype):
     u = torch.tensor([0.0, 1e-30, 0.3, 0.5, 1.0 - 2.0**-24], dtype=dtype)
@@ -55,30 +23,6 @@ def test_gumbel_noise_is_finite_at_both_ends_and_rises_with_the_uniform(dtype):
     assert torch.isfinite(noise).all()
     assert (noise.diff() >= 0).all()
     assert noise[3].item() == pytest.approx(-math.log(math.log(2.0)))
-
-
-def test_gumbel_sampling_frequencies_are_the_softmax(generator):
-    logits = torch.tensor([0.0, 1.0, 2.0, -1.0])
-    action = categorical_sample(logits, gumbel(torch.rand(100_000, 4, generator=generator)))
-    frequency = action.bincount(minlength=4) / len(action)
-    torch.testing.assert_close(frequency, logits.softmax(-1), atol=0.006, rtol=0)
-
-
-def test_a_masked_action_has_no_probability_and_is_never_sampled(generator):
-    logits = torch.tensor([50.0, 0.0, 1.0])
-    masked = mask_logits(logits, torch.tensor([False, True, True]))
-    assert masked.softmax(-1)[0] == 0.0
-    action = categorical_sample(masked, gumbel(torch.rand(50_000, 3, generator=generator)))
-    assert action.unique().tolist() == [1, 2]
-    assert masked.argmax() == 2
-
-
-def test_masking_leaves_the_others_as_a_smaller_categorical():
-    logits, mask = torch.tensor([[5.0, 0.0, 1.0]]), torch.tensor([[False, True, True]])
-    log_prob, entropy = categorical_stats(mask_logits(logits, mask), torch.tensor([2]))
-    reference = Categorical(logits=logits[:, 1:])
-    torch.testing.assert_close(log_prob, reference.log_prob(torch.tensor([1])))
-    torch.testing.assert_close(entropy, reference.entropy())
 
 
 def test_masked_logits_get_no_gradient_and_the_others_a_finite_one():
@@ -91,11 +35,6 @@ def test_masked_logits_get_no_gradient_and_the_others_a_finite_one():
     assert logits.grad[0, 1:].abs().min() > 0
 
 
-def test_no_mask_leaves_logits_alone():
-    logits = torch.randn(3)
-    assert mask_logits(logits, None) is logits
-
-
 def test_tanhs_log_derivative_is_exact_where_the_plain_formula_is_not():
     x = torch.linspace(-15.0, 15.0, 301)
     exact = torch.log1p(-x.double().tanh().square())
@@ -104,36 +43,3 @@ def test_tanhs_log_derivative_is_exact_where_the_plain_formula_is_not():
     far = torch.tensor([-300.0, 300.0], requires_grad=True)
     tanh_log_det(far).sum().backward()
     assert far.grad.tolist() == [2.0, -2.0]  # −2·tanh
-
-
-def test_log_probabilities_of_forbidden_actions_have_no_weight_and_a_finite_product():
-    logits = torch.tensor([[0.0, 5.0, 0.0]])
-    found = masked_log_probs(logits, torch.tensor([[True, False, True]]))
-    assert found.exp().tolist() == [[0.5, 0.0, 0.5]]
-    assert (found * found.exp()).isfinite().all()
-    assert torch.equal(masked_log_probs(logits, None), logits.log_softmax(-1))
-
-
-def test_squashed_samples_and_their_density_are_those_of_torchs_distributions():
-    g = torch.Generator().manual_seed(0)
-    mean, log_std, z = (torch.randn(4, 2, generator=g, dtype=torch.float64) for _ in range(3))
-    law = TransformedDistribution(Normal(mean, log_std.exp()), TanhTransform(cache_size=1))
-    action, log_prob = squashed_sample(mean, log_std, z)
-    u = mean + log_std.exp() * z
-    torch.testing.assert_close(action, u.tanh())
-    torch.testing.assert_close(log_prob, law.log_prob(law.transforms[0](u)).sum(-1))
-
-
-def test_the_entropy_of_narrow_squashed_normals_is_near_the_mean_of_minus_log_density():
-    mean, log_std = torch.tensor([[0.5, -1.0]]), torch.full((1, 2), -4.0)
-    z = torch.randn(100_000, 2, generator=torch.Generator().manual_seed(0))
-    _, log_prob = squashed_sample(mean, log_std, z)
-    found = squashed_entropy(mean, log_std).item()
-    assert found == pytest.approx(-log_prob.mean().item(), abs=0.01)
-
-
-def test_an_action_is_smoothed_by_clipped_noise_within_the_bounds():
-    action, noise = torch.tensor([[[0.0, 0.9]], [[0.0, 0.9]]]), torch.tensor([[[2.0, 2.0]]] * 2)
-    std, bound = torch.tensor([[[0.1]], [[1.0]]]), torch.tensor([[[0.3]], [[0.3]]])
-    found = smoothed_action(action, noise, std, bound)
-    torch.testing.assert_close(found, torch.tensor([[[0.2, 1.0]], [[0.3, 1.0]]]))

@@ -135,17 +135,12 @@ def test_adam_of_no_member_does_nothing(size):
 
 
 def test_gradients_are_clipped_for_each_member_by_itself():
-    grad = torch.tensor([[3.0, 4.0], [0.3, 0.4], [30.0, 40.0]])
-    norm = clip_grad_norm_(grad, torch.tensor([1.0, 1.0, 5.0]))
-    torch.testing.assert_close(norm, torch.tensor([5.0, 0.5, 50.0]))
-    expected = torch.tensor([[0.6, 0.8], [0.3, 0.4], [3.0, 4.0]])
+    grad = torch.tensor([[3.0, 4.0], [0.3, 0.4], [30.0, 40.0], [0.0, 0.0], [3e5, 4e5]])
+    no_limit = torch.finfo(torch.float32).max
+    norm = clip_grad_norm_(grad, torch.tensor([1.0, 1.0, 5.0, 1.0, no_limit]))
+    torch.testing.assert_close(norm, torch.tensor([5.0, 0.5, 50.0, 0.0, 5e5]))
+    expected = torch.tensor([[0.6, 0.8], [0.3, 0.4], [3.0, 4.0], [0.0, 0.0], [3e5, 4e5]])
     torch.testing.assert_close(grad, expected, rtol=1e-5, atol=0)
-
-
-def test_a_zero_gradient_survives_clipping():
-    grad = torch.zeros(1, 3)
-    assert clip_grad_norm_(grad, torch.ones(1)).tolist() == [0.0]
-    assert grad.tolist() == [[0.0] * 3]
 
 
 def test_the_rate_follows_the_kl_and_stays_in_its_range():
@@ -192,24 +187,9 @@ def test_parameters_of_several_ages_move_as_each_would_by_itself():
     assert count.tolist() == [[100_030, 30, 100_030, 30]]
 
 
-def test_a_constant_gradient_moves_a_new_parameter_by_the_rate_and_no_further():
-    params, (mu, nu, _) = torch.zeros(1, 1), adam_state(1, 1)
-    count = torch.zeros(1, 1, dtype=torch.int64)
-    for _ in range(50):
-        adam_(params, torch.ones(1, 1), mu, nu, count, torch.ones(1))
-    assert params.item() == pytest.approx(-50.0, rel=0.01)
-
-
 def test_steps_are_counted_beyond_what_a_float_can_count():
     params, (mu, nu, _) = torch.zeros(1, 2), adam_state(1, 2)
     count = torch.tensor([1 << 24])
     for _ in range(3):
         adam_(params, torch.ones(1, 2), mu, nu, count, torch.ones(1))
     assert count.tolist() == [(1 << 24) + 3]
-
-
-def test_no_limit_leaves_a_gradient_as_it_is():
-    grad = torch.tensor([[3e5, 4e5], [0.0, 0.0]])
-    norm = clip_grad_norm_(grad, torch.full((2,), torch.finfo(torch.float32).max))
-    assert norm.tolist() == [5e5, 0.0]
-    assert grad.tolist() == [[3e5, 4e5], [0.0, 0.0]]

@@ -20,12 +20,6 @@ def advantages(reward, discount, value, next_value, last, lam=0.5):
     return a.flatten().tolist()
 
 
-def test_gae_sums_discounted_deltas_up_to_a_termination():
-    # δ₁ = 2 − 5 = −3; δ₀ = 1 + 0.9·5 − 4 = 1.5; A₀ = 1.5 + 0.9·0.5·(−3) = 0.15
-    got = advantages([1.0, 2.0], [0.9, 0.0], [4.0, 5.0], [5.0, 99.0], [False, True])
-    assert got == pytest.approx([0.15, -3.0], abs=1e-6)
-
-
 def test_gae_bootstraps_a_truncation_and_cuts_the_trace_there():
     # δ₀ = 1 + 0.9·10 − 4 = 6, and nothing of step 1, which belongs to another episode
     got = advantages([1.0, 2.0], [0.9, 0.9], [4.0, 5.0], [10.0, 20.0], [True, True])
@@ -36,12 +30,6 @@ def test_gae_uses_the_discount_of_each_call():
     # A call of τ = 3 steps: 0.9³ = 0.729. δ₁ = 0 + 0.9·10 − 2 = 7; δ₀ = 1 + 0.729·2 − 0 = 2.458
     got = advantages([1.0, 0.0], [0.729, 0.9], [0.0, 2.0], [2.0, 10.0], [False, True])
     assert got == pytest.approx([2.458 + 0.729 * 0.5 * 7.0, 7.0])
-
-
-def test_gae_without_lambda_is_the_one_step_error_and_with_lambda_one_the_whole_return():
-    args = [1.0, 1.0, 1.0], [0.5, 0.5, 0.5], [3.0, 2.0, 1.0], [2.0, 1.0, 8.0], [False, False, True]
-    assert advantages(*args, lam=0.0) == pytest.approx([-1.0, -0.5, 4.0])
-    assert advantages(*args, lam=1.0)[0] == pytest.approx(1 + 0.5 + 0.25 + 0.125 * 8 - 3)
 
 
 def test_gae_of_another_policy_than_the_one_that_acted():
