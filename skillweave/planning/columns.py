@@ -235,12 +235,12 @@ def columns_of(log: CallColumns) -> dict[str, Array]:
 
 def fields_of(columns: Mapping[str, Array]) -> dict[str, Any]:
     """Return the fields of a log whose ``columns_of`` these are."""
-    fields: dict[str, Any] = {"info": {}, "goals": {}}
+    plain, info, goals = dict[str, Array](), dict[str, Array](), dict[str, Array]()
     for name, column in columns.items():
         if name.startswith(INFO):
-            fields["info"][name.removeprefix(INFO)] = column
+            info[name.removeprefix(INFO)] = column
         elif name.startswith(GOAL):
-            fields["goals"][name.removeprefix(GOAL)] = column
+            goals[name.removeprefix(GOAL)] = column
         else:
-            fields[name] = column
-    return fields
+            plain[name] = column
+    return {**plain, "info": info, "goals": goals}

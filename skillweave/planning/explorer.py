@@ -73,18 +73,14 @@ class Explorer(Policy):
         if len(log) < 2:
             return
         graph = CallGraph(log, self._features, self._neighbors)
-        self._far = self._radius_of(graph)
+        sizes = np.array([each.size for each in graph.maps])[graph.options.skills]
+        far = PER_FEATURE * np.sqrt(sizes) if self._radius is None else self._radius
+        self._far = np.broadcast_to(np.float32(far), sizes.shape)
         worth = graph.solve(
             RewardMachine({}), self._gamma, graph.terminated, graph.after, graph.may,
             novel=self._far,
         )  # fmt: skip
         self._graph, self._worth = graph, worth[:, 0]
-
-    def _radius_of(self, graph: CallGraph) -> Array:
-        """Return the distance from which on each option is new, (O,) float32."""
-        sizes = np.array([each.size for each in graph.maps])[graph.options.skills]
-        own = PER_FEATURE * np.sqrt(sizes) if self._radius is None else self._radius
-        return np.broadcast_to(np.float32(own), sizes.shape)
 
     def new_share(self) -> float:
         """Return the share of (end of a call, choice) pairs that are new; 1 before planning."""

@@ -128,8 +128,14 @@ class RewardMachine:
                     f"RewardMachine: the state {pair[0]!r} ends the task, so it has no transition; "
                     f"leave out {pair}"
                 )
+            where = f"RewardMachine: transition {pair}"
             for one in value if isinstance(value, list) else [value]:
-                event, reward = _event_and_reward(one, f"RewardMachine: transition {pair}")
+                given = one if isinstance(one, tuple) else (one, 0.0)
+                if len(given) != 2:
+                    raise DeclarationError(
+                        f"{where} is {short(one)}; write an event, or (event, reward)"
+                    )
+                event, reward = as_event(given[0], where), _checked_reward(given[1], where)
                 if isinstance(event, Held):
                     event = replace(event, slot=slots.get(origin, 0))
                     slots[origin] = event.slot + 1
@@ -408,15 +414,6 @@ def _skills_of(arrow: Arrow, skills: Mapping[str, Any]) -> list[str]:
             )
         chosen += _names(skills[name])
     return chosen
-
-
-def _event_and_reward(value: Any, where: str) -> tuple[Event, Reward]:
-    reward: Any = 0.0
-    if isinstance(value, tuple):
-        if len(value) != 2:
-            raise DeclarationError(f"{where} is {short(value)}; write an event, or (event, reward)")
-        value, reward = value
-    return as_event(value, where), _checked_reward(reward, where)
 
 
 def _checked_reward(reward: Any, where: str) -> Reward:

@@ -68,11 +68,6 @@ class _Part:
         """The number of steps."""
         return len(self.steps["call"])
 
-    @property
-    def nbytes(self) -> int:
-        """The bytes of its steps."""
-        return sum(column.nbytes for column in self.steps.values())
-
 
 class Recorder:
     """Calls of one level of skills in the making, from traces of its steps.
@@ -126,7 +121,7 @@ class Recorder:
         """(S,) bool, with ``own_rewards`` their ``success`` is asked in each step, for ``late``."""
         self.steps = 0
         """Steps that are kept."""
-        self._bytes = 0
+        self._bytes = 0  # of all steps so far
         sizes = {k: goals.space.flat(goals.start(1)).shape[1] for k, goals in self.goals.items()}
         row = np.dtype([*SUMS, *call_fields(spaces[0], skills.choices, sizes, whole=steps)])
         n = num_envs
@@ -349,11 +344,9 @@ class Recorder:
         """Keep a new part, and forget the oldest ones that are not needed."""
         self._parts.append(part)
         self.steps += part.size
-        self._bytes += part.nbytes
+        self._bytes += sum(column.nbytes for column in part.steps.values())
         while self.latest is not None and self.steps - self._parts[0].size >= self.latest:
-            oldest = self._parts.popleft()
-            self.steps -= oldest.size
-            self._bytes -= oldest.nbytes
+            self.steps -= self._parts.popleft().size
         if self.latest is None and self._bytes > MOST_BYTES:
             raise DeclarationError(
                 f"the log of calls has {self.steps:,} steps and more than {MOST_BYTES // 2**30} "

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from worlds import ON, SMALL, SPACES, GoTo, Point, Rest, declared, far_corner, go_to
+from worlds import ON, SMALL, SPACES, GoTo, Point, Rest, declared, go_to
 
 import skillweave as sw
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
@@ -356,27 +356,6 @@ def test_a_network_that_sees_what_is_not_there_is_named_with_its_skill():
         declared(algorithm=wrong).check_spaces()
 
 
-def test_goals_are_the_same_for_the_same_seed():
-    run = declared().train(quiet=True)
-
-    def goals_with(num_envs):
-        found = {}
-
-        def watch(played):
-            for episode, goal in zip(
-                played.episode, played.memory[OWN_GOAL][played.rows], strict=True
-            ):
-                found.setdefault(int(episode), goal.tolist())
-
-        alone = run._policy("go_to")
-        sw.evaluate(alone, Point, episodes=6, num_envs=num_envs, watch=watch)
-        return found
-
-    few, many = goals_with(2), goals_with(6)
-    assert few == many
-    assert len({tuple(goal) for goal in few.values()}) == 6
-
-
 @pytest.mark.parametrize("name", SPACES)
 def test_goals_are_drawn_and_joined(name):
     skill = go_to(name)
@@ -391,7 +370,8 @@ def test_goals_are_drawn_and_joined(name):
     assert np.array_equal(joint["observation"], obs)
     assert np.array_equal(joint["goal"], drawn)
     assert goals.space.flat(drawn).shape == (50, goals.space.size)
-    assert np.array_equal(goals.space.of_numbers(goals.space.flat(drawn)), drawn)
+    back = goals.space.of_numbers(goals.space.flat(drawn))
+    assert (back.dtype, back.tobytes()) == (drawn.dtype, drawn.tobytes())
     assert np.array_equal(
         draw_from(skill.goal_space, 9, np.random.default_rng(3)),
         draw_from(skill.goal_space, 9, np.random.default_rng(3)),
@@ -405,17 +385,6 @@ def test_captions_show_the_goal():
     assert shown_goal(np.zeros((8, 8, 3))) == "(192 numbers)"
     one = draw_from(SPACES["dict"], 1, np.random.default_rng(0))[0]
     assert shown_goal(one).startswith("(at (")
-
-
-def test_goals_reach_the_label_of_a_film():
-    run = declared([go_to(), Rest()], selector=far_corner).train(quiet=True)
-    policy = run.policy
-    memory = policy.start(1)
-    _, memory = policy.act(memory, np.zeros((1, 2), np.float32))
-    assert np.allclose(policy.goal_now(memory), 0.9)
-    player = run.player()
-    player.act(ZERO)
-    assert np.allclose(policy.goal_now(player.memory), 0.9)
 
 
 def test_the_policy_of_a_skill_with_goals_is_saved_and_loaded(tmp_path):

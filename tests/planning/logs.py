@@ -23,23 +23,14 @@ def log_of(
     ``why`` is own, limit, end (the episode terminated) or cut (its time limit). An observation is a
     number, or several.
     """
-    columns: dict[str, list[Any]] = {
-        name: [] for name in ("start", "choice", "why", "won", "episode", "order", "age", "inside")
-    }
-    offset, choices = [0], len(skills) * max(1, len(lengths))
-    for e, (first, calls) in enumerate(episodes):
-        here, age = first, 0
-        for order, (choice, inside, won, why) in enumerate(calls):
-            for name, value in (
-                ("start", here), ("choice", choice), ("why", why), ("won", won), ("episode", e),
-                ("order", order), ("age", age),
-            ):  # fmt: skip
-                columns[name].append(value)
-            columns["inside"] += inside
-            offset.append(offset[-1] + len(inside))
-            here, age = inside[-1], age + len(inside)
-    calls, steps = len(columns["choice"]), offset[-1]
-    why = np.array(columns["why"])
+    rows, inside, choices = list[Any](), list[Any](), len(skills) * max(1, len(lengths))
+    for e, (here, calls) in enumerate(episodes):
+        age = 0
+        for order, (choice, steps, won, why) in enumerate(calls):
+            rows.append((here, choice, won, why, WHY[why], e, order, age, len(steps)))
+            inside += steps
+            here, age = steps[-1], age + len(steps)
+    start, choice, won, why, end, episode, order, age, tau = map(np.array, zip(*rows, strict=True))
     return CallLog(
         tuple(skills),
         tuple(lengths),
@@ -49,19 +40,19 @@ def log_of(
         (True,) * len(skills),
         gym.spaces.Box(-np.inf, np.inf, (size,), np.float32),
         gym.spaces.Discrete(2),
-        start=np.array(columns["start"], np.float32).reshape(calls, size),
-        choice=np.array(columns["choice"], np.int64),
-        end_reason=np.array([WHY[w] for w in columns["why"]], np.int8),
-        succeeded=np.array(columns["won"], bool),
+        start=start.astype(np.float32).reshape(-1, size),
+        choice=choice,
+        end_reason=end.astype(np.int8),
+        succeeded=won,
         terminated=why == "end",
         truncated=why == "cut",
-        episode=np.array(columns["episode"], np.int64),
-        seed=np.array(columns["episode"], np.int64),
-        order=np.array(columns["order"], np.int64),
-        age=np.array(columns["age"], np.int64),
-        may_follow=np.ones((calls, choices), bool),
-        offset=np.array(offset, np.int64),
-        next_obs=np.array(columns["inside"], np.float32).reshape(steps, size),
-        action=np.zeros(steps, np.int64),
-        reward=np.zeros(steps, np.float32) if rewards is None else np.float32(rewards),
+        episode=episode,
+        seed=episode,
+        order=order,
+        age=age,
+        may_follow=np.ones((len(rows), choices), bool),
+        offset=np.concatenate([[0], np.cumsum(tau)]),
+        next_obs=np.array(inside, np.float32).reshape(-1, size),
+        action=np.zeros(len(inside), np.int64),
+        reward=np.zeros(len(inside), np.float32) if rewards is None else np.float32(rewards),
     )

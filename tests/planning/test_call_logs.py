@@ -159,16 +159,6 @@ def test_calls_of_a_selector_and_of_chosen_lengths() -> None:
     assert set(made.choice) == set(range(8))
 
 
-def test_a_call_that_the_time_limit_cut() -> None:
-    class Stay(Wait):
-        max_steps = 7
-
-    made = record_calls(SPEC, SkillSet((Stay(),), (Stay.policy,)), 80, num_envs=1)
-    assert made.tau.tolist() == [7, 7, 7, 7, 7, 5] * 2
-    assert made.was_cut.tolist() == ([False] * 5 + [True]) * 2
-    assert made.truncated.tolist() == made.was_cut.tolist()
-
-
 def test_a_log_is_saved_and_read(log: CallLog, tmp_path: Any) -> None:
     class Move(Skill):
         max_steps = 3

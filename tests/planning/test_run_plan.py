@@ -188,7 +188,6 @@ def test_tasks_and_skills_go_by_the_environments_own_reward_and_success() -> Non
 @pytest.mark.parametrize(
     ("choose", "says"),
     [
-        ("exploring", "'random', 'explore', an Explorer"),
         (Explorer, "'random', 'explore', an Explorer"),
         (always(1), "among 4 skills"),
         (lambda obs: ["nobody"] * len(obs), "nobody"),
