@@ -13,7 +13,6 @@ from worlds import ON, SMALL, SPACES, GoTo, Point, Rest, declared, go_to
 import skillweave as sw
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
 from skillweave.evolution import Evolution
-from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills.goal_spaces import draw_from, shown_goal, with_goal
 from skillweave.skills.goals import goals_of
 from skillweave.spaces import obs_dtype
