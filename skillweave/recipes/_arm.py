@@ -130,6 +130,7 @@ def is_held(obs: Array) -> Array:
 
 
 def _flat(obs: dict[str, Array]) -> Array:
+    """Return the arm's observation and the wanted place as one array."""
     return np.concatenate([obs["observation"], obs["desired_goal"]]).astype(np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Gymnasium spaces to arrays and tensors, and back.
+"""Gymnasium spaces to arrays and tensors, and back, for learning.
 
 Begin with ``packing``: it makes one array of a batch of observations. ``ObsCodec`` makes inputs of
 networks of it, ``ActionCodec`` converts actions of a policy to the environment's.
