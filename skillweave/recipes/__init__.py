@@ -1,6 +1,7 @@
 """Recipes: Python files that declare a hierarchy and its budgets. Some are shipped here.
 
-Those bring the environments that they train in: rooms, an arm, mazes. Recipes stand above ``api``, which finds shipped ones by ``shipped`` and imports none.
+Those bring the environments that they train in: rooms, an arm, mazes. Recipes stand above ``api``,
+which finds shipped ones by ``shipped`` and imports none.
 """
 
 from __future__ import annotations
