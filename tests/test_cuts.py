@@ -215,9 +215,7 @@ def test_a_checkpoint_is_written_when_the_latest_is_old(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     saved: list[int] = []
-    monkeypatch.setattr(
-        RunDirectory, "save_checkpoint", lambda self, state, header, extra: saved.append(1)
-    )
+    monkeypatch.setattr(RunDirectory, "save_checkpoint", lambda *_: saved.append(1))
     monkeypatch.setattr("skillweave.training.loop.CHECKPOINT_SHARE", 1e9)
     train(plain(ON, SYNC)(), tmp_path / "young")
     assert len(saved) == 1  # the last one

@@ -144,7 +144,7 @@ def test_a_checkpoint_without_its_population_is_refused(stopped, tmp_path):
 def _change(run: Path, name: str, damage):
     """Change one tensor of the checkpoint."""
     with _rewritten(run) as (tensors, _):
-        (full,) = [k for k in tensors if k.endswith(f".{name}")]
+        (full,) = [k for k in tensors if f".{k}".endswith(f".{name}")]
         tensors[full] = damage(tensors[full])
         if tensors[full] is None:
             del tensors[full]

@@ -25,9 +25,9 @@ def whole(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         save, init = RunDirectory.save_checkpoint, JointLearner.__init__
 
-        def saved(self, state, header, tensors):
+        def saved(self, header, tensors):
             ended[header.stage] = unprefixed(f"state.{header.stage}", tensors)
-            save(self, state, header, tensors)
+            save(self, header, tensors)
 
         def made(self, parts, how, *more):
             for name, part in parts.items():

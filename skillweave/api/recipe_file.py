@@ -140,10 +140,11 @@ def _beside(path: Path) -> dict[str, Path]:
     due = [path]
     while due:
         try:
-            names = {name.partition(".")[0] for name in imported(due.pop().read_bytes())}
+            found = imported(due.pop().read_bytes())
+            names = dict.fromkeys(name.partition(".")[0] for name in found)
         except (SyntaxError, ValueError):
             continue  # importing it raises the same error, with its line
-        for name in sorted(names):
+        for name in names:
             for file in (folder / name / "__init__.py", folder / f"{name}.py"):
                 if name not in files and name != "skillweave" and file.is_file():
                     files[name] = file.resolve()

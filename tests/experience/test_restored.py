@@ -18,21 +18,21 @@ def kept(tau, prefix=""):
 @pytest.mark.parametrize("prefix", ["", "inner/", "inner/deepest/"])
 def test_only_where_a_call_is_open_is_an_observation_looked_at(prefix):
     written = {f"{prefix}obs": np.array([2, 0, 3])}  # nothing was written for the second
-    found = opened(written, kept([4, 0, 1], prefix), SEEN, SPACE)
+    found = opened(written, kept([4, 0, 1], prefix), SEEN, SPACE, {})
     assert found[f"{prefix}obs"].tolist() == [2, 0, 3]
     with pytest.raises(ValueError, match="a choice that does not exist"):
-        opened(written, kept([4, 1, 1], prefix), SEEN, SPACE)
+        opened(written, kept([4, 1, 1], prefix), SEEN, SPACE, {})
 
 
 def test_what_a_diverged_member_decided_by_is_nought_and_infinity_is_refused():
     head = np.array([[1, np.nan], [0, 2]], np.float32)
-    assert opened({"dist_params": head}, {}, SEEN[:2], SPACE)["dist_params"].tolist() == [
+    assert opened({"dist_params": head}, {}, SEEN[:2], SPACE, {})["dist_params"].tolist() == [
         [1, 0],
         [0, 2],
     ]
     head[0, 1] = np.inf
     with pytest.raises(ValueError, match="'dist_params' of open calls is not finite"):
-        opened({"dist_params": head}, {}, SEEN[:2], SPACE)
+        opened({"dist_params": head}, {}, SEEN[:2], SPACE, {})
 
 
 @pytest.mark.parametrize(

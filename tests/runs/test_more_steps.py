@@ -39,7 +39,7 @@ from skillweave.runs.files import read_tensors
 from skillweave.runs.manifest import StageEntry
 from skillweave.training import stage_log
 from skillweave.training.periodic import PeriodicEvaluation
-from skillweave.types import TrainEvent
+from skillweave.types import TrainEvent, unprefixed
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 
@@ -66,7 +66,7 @@ def train(path: Path, steps: int, algorithm: Any = ON, **how: Any) -> Run:
 
 def final(path: Path) -> dict[str, torch.Tensor]:
     """The final state of an agent."""
-    return read_tensors(path / "final/agent.safetensors")[0]
+    return unprefixed("state.agent", read_tensors(path / "final/agent.safetensors")[0])
 
 
 KINDS: dict[str, Callable[[int], Any]] = {
