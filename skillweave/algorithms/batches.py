@@ -56,7 +56,7 @@ SCHEMA: dict[str, Column] = {
     "guide": Column(),  # (T, N, A) float32, logits of a ready selector's choice
     "overridden": Column(),  # (T, N) bool, a reflex acted instead of ``action``
     "call_start": Column(),  # (T, N) bool, a call starts here; for critics of skills
-    # To judge a skill's reward, termination and success again later:
+    # As the environment itself gave them; skills are judged by these:
     "env_reward": Column(raw=True),  # (T, N) float32, the environment's own
     "env_action": _RAW,  # (T, N, …), in the environment's units
     "env_terminated": _RAW,  # (T, N) bool, the environment's own end
