@@ -11,7 +11,7 @@ from skillweave import SkillweaveError
 def test_every_function_on_the_walk_runs_and_they_are_soon_read(name):
     env, config = reading.ROUNDS[name]
     found = reading.on_the_walk(name, reading.watched(reading.one_round(env, config, 256)))
-    assert len({reading.file_of(code) for code in found}) <= 14
+    assert len({reading.file_of(code) for code in found}) <= 15
     assert 400 < reading.lines_of(found) <= 1_500
 
 
