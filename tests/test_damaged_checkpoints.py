@@ -110,7 +110,7 @@ CASES = [
     ("together", "collector.0.kept.player.elapsed", "negative"),
     ("together", "collector.0.kept.player.length", "far too large"),
     ("together", "collector.0.open.obs", "missing"),
-    ("together", "counts.left", "negative"),
+    ("together", "learner.counts", "negative"),
     ("together", "loop.report", "negative"),
     ("together", "loop.report", "doubles"),
     ("together", "loop.report", "empty"),

@@ -484,8 +484,8 @@ def restored_stages(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     found: set[str] = set()
     plain = RunDirectory.load_checkpoint
 
-    def noted(self: RunDirectory, stage: str, like: Any) -> Any:
-        loaded = plain(self, stage, like)
+    def noted(self: RunDirectory, stage: str) -> Any:
+        loaded = plain(self, stage)
         if loaded is not None:
             found.add(stage)
         return loaded
