@@ -207,10 +207,8 @@ class GymnasiumEngine(WatchedEngine):
         self.trains = False
         """Learners learn from these environments."""
         self._draws = GlobalDraws(LOOKS if are_collected() else 0)
-        self._dtype, self._shape = (
-            obs_dtype(env.observation_space),
-            obs_shape(env.observation_space),
-        )
+        self._dtype = obs_dtype(env.observation_space)
+        self._shape = obs_shape(env.observation_space)
         self._action_dtype = obs_dtype(self.action_space)
         whole = space_of(self.action_space)
         self._parts = None if whole.parts is None else whole

@@ -290,7 +290,7 @@ def most_read(named: Views, units: Units, count: int) -> Tensor:
 
 
 def narrowed(named: Views, units: Units, units_to_keep: Tensor) -> dict[str, Tensor]:
-    """Keep only the units ``kept`` (R, m)."""
+    """Keep only ``units_to_keep``, (R, m)."""
     cropped = dict(named)
     rows = len(units_to_keep)
     for part in (*units.own, *units.onward):

@@ -300,6 +300,7 @@ class RunDirectory:
         self.write(FINAL, header.stage, tensors, self._filled(header), header.stage)
 
     def _filled(self, header: Checkpoint) -> Checkpoint:
+        """Return a header that also has this run's id and the sizes of its files."""
         header = replace(header, run=self.manifest.id)
         self.record_lines(header)
         return header
