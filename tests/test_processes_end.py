@@ -33,13 +33,14 @@ class Env(gym.Env):
         if multiprocessing.parent_process() is not None:
             open(f"pid-{os.getpid()}", "w").close()
             if what == "children":
-                open(f"child-{subprocess.Popen(['sleep', '60']).pid}", "w").close()
+                open(f"child-{subprocess.Popen(['sleep', '600']).pid}", "w").close()
             if what == "constructor":
                 time.sleep(1000)
     def reset(self, *, seed=None, options=None):
         return np.zeros(1, np.float32), {}
     def step(self, action):
         if multiprocessing.parent_process() is not None:
+            open(f"step-{os.getpid()}", "w").close()
             if what == "children":
                 forever()
             if what in blocks:
@@ -63,8 +64,9 @@ if __name__ == "__main__":
 CLOSES = ("rollout", "sleep", "socket", "part", "spawn")
 
 
-def begun(folder: Path) -> set[int]:
-    return {int(file.name.split("-")[1]) for file in folder.glob("pid-*")}
+def numbers(folder: Path, what: str) -> set[int]:
+    """Return the processes that have written a file of this name."""
+    return {int(file.name.split("-")[1]) for file in folder.glob(f"{what}-*")}
 
 
 @pytest.mark.slow
@@ -76,14 +78,17 @@ def test_processes_end_soon_after_their_parent_was_killed(what, tmp_path):
     command = [sys.executable, "program.py", what]
     parent = subprocess.Popen(command, cwd=tmp_path, env=os.environ | paths)
     until = time.monotonic() + 60
-    while len(begun(tmp_path)) < 2 and time.monotonic() < until:
+    while time.monotonic() < until and not (
+        len(numbers(tmp_path, "pid")) == 2
+        and (what == "constructor" or numbers(tmp_path, "step"))
+    ):
         time.sleep(0.1)
-    time.sleep(1.5)  # in their first rollout
+    time.sleep(1.0)  # well in what blocks
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    pids = begun(tmp_path)
+    pids = numbers(tmp_path, "pid")
     assert len(pids) == 2
-    pids |= {int(file.name.split("-")[1]) for file in tmp_path.glob("child-*")}
+    pids |= numbers(tmp_path, "child")
     assert (len(pids) > 2) == (what == "children")
     try:
         assert all_end(pids)
@@ -91,4 +96,4 @@ def test_processes_end_soon_after_their_parent_was_killed(what, tmp_path):
         for pid in filter(alive, pids):
             os.kill(pid, signal.SIGKILL)
     if what in CLOSES:  # environments could release what they hold
-        assert {int(f.name.split("-")[1]) for f in tmp_path.glob("closed-*")} == pids
+        assert numbers(tmp_path, "closed") == pids

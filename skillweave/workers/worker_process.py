@@ -20,7 +20,7 @@ from skillweave.workers.host import SentError, WorkerHost, error_to_send
 
 LOOK = 1.0
 """Seconds between checks that the parent lives."""
-GRACE = 2.0
+GRACE = 5.0
 """Seconds that environments have to close after the parent has ended."""
 LEFT = 0.3
 """Seconds that processes of environments have to end, first by themselves and then by SIGTERM."""
@@ -104,7 +104,7 @@ def work(
             if notices.any:
                 _send(channel, None, None, notices)
     except _Ended:
-        return
+        _end_rest_of_group()
 
 
 def _tasks(channel: Channel) -> Iterator[tuple[str, Any]]:
@@ -196,6 +196,13 @@ def kill_group() -> None:
     if os.getpgrp() == os.getpid():
         os.killpg(0, signal.SIGKILL)
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _end_rest_of_group() -> None:
+    """End what environments have started and left: the parent, which would, may have ended."""
+    if os.getpgrp() == os.getpid():
+        handle_here(signal.SIGTERM, signal.SIG_IGN)
+        os.killpg(0, signal.SIGTERM)
 
 
 def end_group(leader: int) -> None:
