@@ -5,8 +5,7 @@ This module imports no torch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 from gymnasium import Space
@@ -28,20 +27,8 @@ if TYPE_CHECKING:
 else:
     __all__, __getattr__, __dir__ = lazy(__name__)
 
-T = TypeVar("T")
 Memory: TypeAlias = dict[str, Array]
 """A policy's state of each environment: arrays whose first axis is the environment."""
-
-
-def prefixed(prefix: str, named: Mapping[str, T]) -> dict[str, T]:
-    """Return the dict with each name as ``prefix.name``."""
-    return {f"{prefix}.{k}": v for k, v in named.items()}
-
-
-def unprefixed(prefix: str, named: Mapping[str, T]) -> dict[str, T]:
-    """Return the entries with names ``prefix.name``, as ``name``."""
-    start = f"{prefix}."
-    return {k.removeprefix(start): v for k, v in named.items() if k.startswith(start)}
 
 
 LARGEST_REWARD = 1e15

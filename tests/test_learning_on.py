@@ -8,10 +8,10 @@ from small_runs import Left, Push, assert_same, new_run
 from test_together import Other, declare
 
 from skillweave import SkillweaveError
+from skillweave._internal.prefixes import unprefixed
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.joint import JointLearner
-from skillweave.types import unprefixed
 
 
 def then(**how):

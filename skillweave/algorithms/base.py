@@ -10,6 +10,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
+from skillweave._internal.prefixes import prefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.batches import Report
 from skillweave.algorithms.config import check_spaces
@@ -32,7 +33,7 @@ from skillweave.spaces import (
     numbered_choice_codec,
     obs_codec,
 )
-from skillweave.types import Array, prefixed
+from skillweave.types import Array
 
 S = TypeVar("S")
 Device = torch.device | str

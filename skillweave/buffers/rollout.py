@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.prefixes import unprefixed
 from skillweave.algorithms.batches import SCHEMA, Batch, Reference, Rollout, column
 from skillweave.buffers.held import ONE_ROW, check_held
 from skillweave.spaces import ActionCodec, to_tensor
-from skillweave.types import Array, unprefixed
+from skillweave.types import Array
 
 
 class RolloutStore:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.config import AlgorithmConfig
@@ -30,7 +31,7 @@ from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Loop, Progress
 from skillweave.training.periodic import episodes_of
 from skillweave.training.replay_learner import ReplayLearner, check_counts, store_of
-from skillweave.types import Array, prefixed, unprefixed
+from skillweave.types import Array
 
 OnGenerationTick = Callable[[int, dict[str, float]], None]
 """Receives the steps of all members in this generation so far, and the metrics of an update."""

@@ -125,7 +125,7 @@ class Parts:
 
 
 class PartHost:
-    """A part at its worker; arguments and results are plain data."""
+    """A part of a population at its worker; arguments and results are plain data."""
 
     def __init__(self, part: Part, eval_envs: FitnessEnvs) -> None:
         self._part = part
@@ -154,7 +154,7 @@ class PartHost:
         return self._part.restore(_tensors(state), (), {})
 
     def close(self) -> None:
-        """Release the environments."""
+        """Release the environments in which the members train, and those of their fitness."""
         self._part.close()
         self._eval_envs.close()
 

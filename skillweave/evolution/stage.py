@@ -16,6 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from skillweave._internal import interrupts
+from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
@@ -29,7 +30,7 @@ from skillweave.networks.config import Network
 from skillweave.runs.manifest import BestEntry, Generation, LineageLine, MemberEntry, Winner
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import StageRun
-from skillweave.types import Array, prefixed, unprefixed
+from skillweave.types import Array
 from skillweave.workers.placement import LOCAL, Placement
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds, seed_global_generators
 from skillweave.algorithms.batches import Batch, Trace, padded_last_axis, side_by_side
 from skillweave.envs.engine import Engine, RawStep, checksums
@@ -33,7 +34,7 @@ from skillweave.policies.core import (
 from skillweave.policies.spaces import Space, space_of
 from skillweave.skills.goals import goals_of
 from skillweave.skills.outputs import info_keys
-from skillweave.types import Array, Step, prefixed, unprefixed
+from skillweave.types import Array, Step
 
 RETURN, TASK_RETURN, LENGTH, SUCCESS = range(4)
 """The first columns of ``Collected.episodes``."""

@@ -6,11 +6,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.acting import Request
 from skillweave.experience.collector import Collected, Collector, joined_collected
-from skillweave.types import Array, prefixed, unprefixed
+from skillweave.types import Array
 
 MakeCollector = Callable[[int, int], Collector]
 """Given how many environments and the number of the first one, makes a collector."""

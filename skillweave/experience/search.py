@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from skillweave._internal.prefixes import prefixed
 from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows, random_actions
 from skillweave.errors import TrainingError
@@ -18,7 +19,7 @@ from skillweave.policies.core import RUNNING, Turn, World, flat, observed, part_
 from skillweave.skills import Skill, asked
 from skillweave.skills.skill_set import SkillSet, acting_policy, within
 from skillweave.spaces import obs_dtype, obs_shape
-from skillweave.types import Array, Step, prefixed
+from skillweave.types import Array, Step
 
 PATIENCE = 5_000
 """Steps of an environment in search of a state where the skill may start, if none is ever found."""

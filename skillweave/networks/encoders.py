@@ -266,6 +266,7 @@ def sum_of_rows(rows: Tensor, table: Tensor) -> Tensor:
 
 
 def _sums(rows: Tensor, table: Tensor) -> Tensor:
+    """Return each member's sums of rows of its table, see ``sum_of_rows``."""
     members, size = table.shape[:2]
     if members > 1:  # the members' tables are stacked into one
         rows = rows + torch.arange(members, device=rows.device)[:, None, None] * size

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from skillweave._internal.paths import CRITIC, SELECTOR, decides, level_of, relative
+from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.batches import Reference
@@ -39,7 +40,7 @@ from skillweave.training.replay_learner import learner_of
 from skillweave.training.stage import Together
 from skillweave.training.stage_log import StageLog, resumed, success_rate
 from skillweave.training.stage_run import StageRun
-from skillweave.types import Array, prefixed, unprefixed
+from skillweave.types import Array
 from skillweave.workers.placement import MakeCollectors, make_collectors
 
 EARLY = 0.25

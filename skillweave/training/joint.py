@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from skillweave._internal.paths import CRITIC, SELECTOR, decides, join, name_of, relative
+from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave.algorithms.batches import Batch
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.errors import RunError
@@ -16,7 +17,7 @@ from skillweave.experience.acting import Request
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import normalize
 from skillweave.training.learner import Learner, RolloutLearner, Stack
-from skillweave.types import Array, prefixed, unprefixed
+from skillweave.types import Array
 
 
 class JointLearner:

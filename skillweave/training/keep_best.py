@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave.algorithms.policy import state_from
 from skillweave.runs.manifest import BestSoFar
-from skillweave.types import prefixed, unprefixed
 
 
 class KeepBest:

@@ -13,12 +13,13 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.batches import Batch, Reference, Rehearsal
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.experience.acting import Request
-from skillweave.types import Array, prefixed, unprefixed
+from skillweave.types import Array
 
 
 @dataclass

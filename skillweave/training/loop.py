@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from skillweave._internal import interrupts
+from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.batches import Batch
 from skillweave.experience.group import Collectors
@@ -29,7 +30,7 @@ from skillweave.ops.threads import WorkThread, torch_threads
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, Tick, to_numbers
 from skillweave.training.learner import Learner, crossed
-from skillweave.types import Array, prefixed, unprefixed
+from skillweave.types import Array
 
 CHECKPOINT_SECONDS = 60.0
 """Age of the latest checkpoint in seconds at which the next one is written."""

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.batches import Batch
@@ -18,7 +19,7 @@ from skillweave.experience.acting import ActionRepeat, Request
 from skillweave.ops.device import resolve_device
 from skillweave.spaces import to_tensor
 from skillweave.training.learner import RolloutLearner, Stack, acting_of, member_seeds
-from skillweave.types import Array, prefixed, unprefixed
+from skillweave.types import Array
 
 DRAWN_AT_ONCE = 8
 """Gradient steps whose samples are drawn at once."""

@@ -30,6 +30,7 @@ from small_runs import (
 
 import skillweave as sw
 from skillweave import SAC, Agent, EnvSpec, Hierarchy, Network, Reflex, Run, SkillweaveError
+from skillweave._internal.prefixes import unprefixed
 from skillweave.cli.main import main
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution import Evolution
@@ -39,7 +40,7 @@ from skillweave.runs.files import read_tensors
 from skillweave.runs.manifest import StageEntry
 from skillweave.training import stage_log
 from skillweave.training.periodic import PeriodicEvaluation
-from skillweave.types import TrainEvent, unprefixed
+from skillweave.types import TrainEvent
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 

@@ -18,6 +18,7 @@ from toys import (
     training,
 )
 
+from skillweave._internal.prefixes import unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import DQN, SAC, TD3
 from skillweave.algorithms.dqn import DQNAlgorithm
@@ -30,7 +31,6 @@ from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack, crossed
 from skillweave.training.loop import Loop, Progress, Saved
 from skillweave.training.replay_learner import ReplayLearner, store_of
-from skillweave.types import unprefixed
 
 SETTINGS: dict[str, Any] = {
     "num_envs": 4, "batch_size": 8, "learning_starts": 40, "buffer_size": 400, "gamma": 0.9,
