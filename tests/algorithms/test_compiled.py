@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -29,17 +28,27 @@ from skillweave.workers.shipping import packed, unpacked
 P, B = 2, 16
 OBS = gym.spaces.Box(-1.0, 1.0, (3,))
 FORCE, CHOICES = gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Discrete(3)
-SMALL: dict[str, Any] = {"network": Network((8,), "relu", layer_norm=True), "normalize_obs": True}
+SMALL = {"network": Network((8,), "relu", layer_norm=True), "normalize_obs": True}
 needs_compiler = pytest.mark.skipif(
     not (shutil.which("g++") or shutil.which("clang")), reason="no C++ compiler"
 )
 
 
-def learnt(config: Any, space: gym.Space[Any], data: list[Any]) -> list[tuple[Any, list[Any]]]:
+@pytest.fixture(autouse=True)
+def backend(monkeypatch, request):
+    """A C++ compiler takes most of the time: one case of each test goes all the way.
+
+    The others go as far as torch traces the whole step, its backward pass and its changes in place.
+    """
+    backend = getattr(request, "param", "aot_eager")
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
+
+
+def learnt(config, space: gym.Space[Any], data: list[Any]) -> list[tuple[Any, list[Any]]]:
     """The state and the metrics after updates by plain steps, then by compiled ones."""
     found = []
     for compile in (False, True):
-        algorithm: Any = make_algorithm(replace(config, compile=compile), OBS, space)
+        algorithm = make_algorithm(replace(config, compile=compile), OBS, space)
         state, told = algorithm.init([Seeds(m) for m in range(P)]), []
         for u, each in enumerate(data):
             generators = [(Seeds(u) / m).torch() for m in range(P)]
@@ -48,14 +57,12 @@ def learnt(config: Any, space: gym.Space[Any], data: list[Any]) -> list[tuple[An
     return found
 
 
-def assert_close(state: Any, other: Any, **how: float) -> None:
+def assert_close(state, other, **how: float):
     for f in fields(state):
         one, two = getattr(state, f.name), getattr(other, f.name)
         torch.testing.assert_close(one, two, msg=f.name, **how)
 
 
-# A C++ compiler takes most of the time: one algorithm goes all the way, the others as far as torch
-# traces the whole step, its backward pass and its changes in place.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "space", "backend"),
@@ -65,11 +72,9 @@ def assert_close(state: Any, other: Any, **how: float) -> None:
         (SAC, FORCE, "aot_eager"),
     ],
     ids=["rainbow", "td3", "sac"],
+    indirect=["backend"],
 )
-def test_compiled_steps_equal_plain_ones(
-    kind: Any, space: gym.Space[Any], backend: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
+def test_compiled_steps_equal_plain_ones(kind, space, backend):
     drawn = [transitions(space, (P, B), masked=space is CHOICES, seed=u) for u in range(5)]
     data = [replace(each, progress=0.1) for each in drawn]
     (plain, _), (fused, _) = learnt(kind(**SMALL), space, data)
@@ -81,6 +86,19 @@ def rehearsed(width: int, log_std: torch.Tensor | None = None) -> Rehearsal:
     g = torch.Generator().manual_seed(7)
     obs, did = (torch.randn(P, 9, n, generator=g) for n in (3, width))
     return Rehearsal(obs, did, log_std)
+
+
+def small_ppo(**settings) -> tuple[Any, Any]:
+    """An algorithm on three actions, and P members."""
+    config = PPO(**(SMALL | settings), num_envs=4, n_steps=8, batch_size=16)
+    algorithm = make_algorithm(config, OBS, CHOICES)
+    return algorithm, algorithm.init([Seeds(m) for m in range(P)])
+
+
+def near() -> Reference:
+    """The policies of fresh members: a learner stays near them."""
+    algorithm, state = small_ppo()
+    return Reference(algorithm.acting_params(state), torch.ones(P))
 
 
 def rollout(space: gym.Space[Any], seed: int) -> Rollout:
@@ -115,22 +133,18 @@ def rollout(space: gym.Space[Any], seed: int) -> Rollout:
     [
         pytest.param(PPO, {}, CHOICES, "inductor", marks=needs_compiler),
         (PPO, {"learning_rate_schedule": "kl", "target_kl": 0.01}, FORCE, "aot_eager"),
-        (PPO, {"target_kl": 0.002}, CHOICES, "aot_eager"),
+        # After one large step the next would be beyond the limit.
+        (PPO, {"target_kl": 1e-4, "learning_rate": 0.1}, CHOICES, "aot_eager"),
         (SelfImitationPPO, {"clip_value": 0.2, "imitation_rows": 64}, FORCE, "aot_eager"),
         (PPO, {"rehearsal": rehearsed(3)}, CHOICES, "aot_eager"),
         (PPO, {"rehearsal": rehearsed(2, torch.zeros(P, 1, 2))}, FORCE, "aot_eager"),
+        (PPO, {"reference": near()}, CHOICES, "aot_eager"),
     ],
-    ids=["ppo", "kl-rate", "kl-limit", "self-imitation", "rehearsal", "rehearsal-force"],
+    ids=["ppo", "kl-rate", "kl-limit", "self-imitation", "rehearsal", "rehearsal-force", "near"],
+    indirect=["backend"],
 )
-def test_compiled_steps_of_rollouts_equal_plain_ones(
-    kind: Any,
-    settings: dict[str, Any],
-    space: gym.Space[Any],
-    backend: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
-    more = {"rehearsal": settings.get("rehearsal")}
+def test_compiled_steps_of_rollouts_equal_plain_ones(kind, settings, space, backend):
+    more = {k: v for k, v in settings.items() if k in ("rehearsal", "reference")}
     settings = {k: v for k, v in settings.items() if k not in more}
     config = kind(**SMALL, **settings, num_envs=4, n_steps=8, batch_size=16)
     # Each rollout has other numbers of rows.
@@ -143,53 +157,13 @@ def test_compiled_steps_of_rollouts_equal_plain_ones(
             torch.testing.assert_close(other[name], own[name], rtol=1e-2, atol=1e-4, msg=name)
 
 
-def small_ppo(**settings: Any) -> tuple[Any, Any]:
-    """An algorithm on three actions, and P members."""
-    config = PPO(**(SMALL | settings), num_envs=4, n_steps=8, batch_size=16)
-    algorithm: Any = make_algorithm(config, OBS, CHOICES)
-    return algorithm, algorithm.init([Seeds(m) for m in range(P)])
-
-
-def learn(algorithm: Any, state: Any, **changed: Any) -> None:
+def learn(algorithm, state, **changed):
     data = replace(rollout(algorithm.action_space, 0), **changed)
     algorithm.update(state, data, [Seeds(m).torch() for m in range(P)])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("compile", [True, False])
-def test_a_member_stops_where_it_oversteps_the_kl(
-    compile: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """After one large step the next would be beyond the limit: the count of steps tells."""
-    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="aot_eager"))
-    algorithm, state = small_ppo(
-        learning_rate=0.1, target_kl=1e-4, update_epochs=5, compile=compile
-    )
-    learn(algorithm, state)
-    assert (state.count >= 1).all()
-    assert (state.count < 5).all()
-
-
-@pytest.mark.slow
-def test_a_learner_that_stays_near_another_compiled_learns_what_it_learns_plainly(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="aot_eager"))
-    params = []
-    for compile in (False, True):
-        algorithm, state = small_ppo(compile=compile)
-        near = Reference(algorithm.acting_params(state), torch.ones(P))
-        learn(algorithm, state, reference=near)
-        learn(algorithm, state, reference=near)
-        params.append(state.params)
-    torch.testing.assert_close(*params, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_an_algorithm_that_has_compiled_can_be_sent_to_another_process(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="aot_eager"))
+def test_an_algorithm_that_has_compiled_can_be_sent_to_another_process():
     algorithm, state = small_ppo(compile=True)
     learn(algorithm, state)
     again = unpacked(packed(algorithm, "it"))
@@ -203,13 +177,13 @@ class Branching:
 
     size = 3
 
-    def __init__(self, obs: Any) -> None:
-        self.shapes: dict[str, tuple[int, ...]] = {}
+    def __init__(self, obs):
+        self.shapes = {}
 
-    def init_(self, views: Any, generators: Any) -> None:
+    def init_(self, views, generators):
         """There is nothing to fill."""
 
-    def __call__(self, views: Any, inputs: Any) -> Any:
+    def __call__(self, views, inputs):
         seen = inputs["vector"]
         return seen if bool(seen.sum() > 0.0) else 2.0 * seen
 
@@ -218,7 +192,7 @@ register_encoder("branching", Branching)
 
 
 @pytest.mark.slow
-def test_what_cannot_be_compiled_goes_on_without_where_it_is_tried() -> None:
+def test_what_cannot_be_compiled_goes_on_without_where_it_is_tried():
     network, says = Network((8,), encoder="branching"), r"PPO\.compile: the gradient step could not"
     algorithm, state = small_ppo(network=network, compile=True)
     with pytest.raises(SkillweaveError, match=f"{says}.*or leave it at False"):
@@ -233,13 +207,13 @@ def test_what_cannot_be_compiled_goes_on_without_where_it_is_tried() -> None:
     torch.testing.assert_close(state.params, expected.params, rtol=0.0, atol=0.0)
 
 
-def test_a_memory_is_not_compiled_where_it_is_tried() -> None:
+def test_a_memory_is_not_compiled_where_it_is_tried():
     assert PPO(compile="auto", network=Network(rnn=RNN())).compile == "auto"
     with pytest.raises(DeclarationError, match=r"compile is True; it must be False where network"):
         PPO(compile=True, network=Network(rnn=RNN()))
 
 
-def test_a_torch_that_cannot_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_torch_that_cannot_says_so(monkeypatch):
     from torch._dynamo import config
 
     class Old:
@@ -253,7 +227,7 @@ def test_a_torch_that_cannot_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_no_compiler_says_so_but_where_it_is_tried(tmp_path: Path) -> None:
+def test_no_compiler_says_so_but_where_it_is_tried(tmp_path):
     code = """
 import torch
 from skillweave import PPO, SAC, SkillweaveError

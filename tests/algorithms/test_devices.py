@@ -6,7 +6,6 @@ It refuses operations that mix devices, and every question for a value: those ma
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,13 +26,13 @@ from skillweave.ops.device import Constant, all_false, on_host, resolve_device
 from skillweave.training.learner import RolloutLearner, Stack, keep_to_guide
 
 P, T, B = 2, 4, 3
-SMALL: dict[str, Any] = {"network": Network((8,)), "normalize_obs": True}
+SMALL = {"network": Network((8,)), "normalize_obs": True}
 SEEN = Box(-1.0, 1.0, (2,), np.float32)
 MIXED = Dict(vector=SEEN, image=Box(0, 255, (8, 8, 1), np.uint8))
 LINE, CHOICE, FORCE = Discrete(3), MultiDiscrete([2, 3]), Box(-1.0, 1.0, (2,), np.float32)
 THERE = torch.device("meta")
 
-ON: dict[str, tuple[PPO, Any, Any]] = {
+ON = {
     "discrete": (PPO(**SMALL), SEEN, LINE),
     "several": (PPO(**SMALL), SEEN, CHOICE),
     "continuous": (PPO(**SMALL, clip_value=0.2), SEEN, FORCE),
@@ -43,7 +42,7 @@ ON: dict[str, tuple[PPO, Any, Any]] = {
     "gru": (PPO(network=Network((8,), rnn=RNN("gru", 4))), SEEN, LINE),
     "images": (PPO(network=Network((8,), cnn=CNN("plain", (4,), (3,), (3,)))), MIXED, LINE),
 }
-OFF: dict[str, tuple[Any, Any]] = {
+OFF = {
     "dqn": (DQN(**SMALL), LINE),
     "rainbow": (DQN.rainbow(**SMALL), LINE),
     "td3": (TD3(**SMALL, policy_delay=1), FORCE),
@@ -53,10 +52,10 @@ OFF: dict[str, tuple[Any, Any]] = {
 }
 
 
-def moved(x: Any, mode: FakeTensorMode, device: torch.device = THERE) -> Any:
+def moved(x, mode: FakeTensorMode, device: torch.device = THERE):
     """Tensors within ``x`` as fake ones on a device."""
 
-    def move(v: Any) -> Any:
+    def move(v):
         return mode.from_tensor(v).to(device) if isinstance(v, torch.Tensor) else v
 
     if hasattr(x, "__dataclass_fields__"):
@@ -64,11 +63,11 @@ def moved(x: Any, mode: FakeTensorMode, device: torch.device = THERE) -> Any:
     return tree_map(move, x)
 
 
-def devices(x: Any) -> set[str]:
+def devices(x) -> set[str]:
     return {v.device.type for v in vars(x).values() if isinstance(v, torch.Tensor)}
 
 
-def rows(algorithm: Any, lead: tuple[int, ...]) -> torch.Tensor:
+def rows(algorithm, lead: tuple[int, ...]) -> torch.Tensor:
     return torch.zeros(
         *lead,
         *algorithm.obs.item,
@@ -76,12 +75,21 @@ def rows(algorithm: Any, lead: tuple[int, ...]) -> torch.Tensor:
     )
 
 
-def actions(algorithm: Any, lead: tuple[int, ...]) -> torch.Tensor:
+def actions(algorithm, lead: tuple[int, ...]) -> torch.Tensor:
     space = algorithm.action_space
     return torch.zeros(*lead, *space.shape, dtype=torch.int64 if algorithm.codec.discrete else None)
 
 
-def on_device(algorithm: Any, mode: FakeTensorMode) -> Any:
+def rollout(algorithm, **more) -> Rollout:
+    lead, width = (P, T, B), algorithm.head.width
+    return Rollout(
+        rows(algorithm, lead), actions(algorithm, lead), torch.zeros(lead), torch.zeros(lead),
+        rows(algorithm, lead), torch.zeros(lead, dtype=torch.bool),
+        dist_params=torch.zeros(*lead, width), **more,
+    )  # fmt: skip
+
+
+def on_device(algorithm, mode: FakeTensorMode):
     """Fresh members whose numbers, but for those that Python decides by, are on the device."""
     state = algorithm.init([Seeds(m) for m in range(P)])
     fake = {k: v if k in state.HOST else mode.from_tensor(v) for k, v in vars(state).items()}
@@ -97,16 +105,13 @@ def test_ppo_learns_and_acts_where_its_state_is(name, monkeypatch):
     algorithm = make_algorithm(replace(config, batch_size=6, update_epochs=2), seen, space)
     # Only here may a host wait; the number of ends of a rollout, say.
     monkeypatch.setattr(rollouts, "on_host", lambda *counts: [3 for _ in counts])
-    lead, width = (P, T, B), algorithm.head.width
+    lead, width, numbers = (P, T, B), algorithm.head.width, not algorithm.codec.discrete
     memory = torch.zeros(P, B, algorithm.memory_size) if algorithm.memory_size else None
-    last = torch.zeros(lead, dtype=torch.bool)
-    batch = Rollout(
-        rows(algorithm, lead), actions(algorithm, lead), torch.zeros(lead), torch.zeros(lead),
-        rows(algorithm, lead), last, dist_params=torch.zeros(*lead, width),
-        mask=torch.ones(*lead, width, dtype=torch.bool) if algorithm.codec.discrete else None,
-        log_std=None if algorithm.codec.discrete else torch.zeros(P, 1, 1, width),
-        recurrent_state=memory, episode_start=None if memory is None else last,
-        overridden=last,
+    no = torch.zeros(lead, dtype=torch.bool)
+    batch = rollout(
+        algorithm, mask=None if numbers else torch.ones(*lead, width, dtype=torch.bool),
+        log_std=torch.zeros(P, 1, 1, width) if numbers else None,
+        recurrent_state=memory, episode_start=None if memory is None else no, overridden=no,
     )  # fmt: skip
     rng = [Seeds(m).torch() for m in range(P)]
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
@@ -124,13 +129,7 @@ def test_a_selector_near_its_guide_learns_where_its_state_is_and_is_kept_on_the_
     config, seen, space = ON["discrete"]
     algorithm = make_algorithm(replace(config, batch_size=6, update_epochs=2), seen, space)
     monkeypatch.setattr(rollouts, "on_host", lambda *counts: [3 for _ in counts])
-    lead, width = (P, T, B), algorithm.head.width
-    batch = Rollout(
-        rows(algorithm, lead), actions(algorithm, lead), torch.zeros(lead), torch.zeros(lead),
-        rows(algorithm, lead), torch.zeros(lead, dtype=torch.bool),
-        dist_params=torch.zeros(*lead, width),
-        guide=torch.zeros(*lead, width),
-    )  # fmt: skip
+    batch = rollout(algorithm, guide=torch.zeros(P, T, B, algorithm.head.width))
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         learner = RolloutLearner(Stack(algorithm, on_device(algorithm, mode)), Seeds(0))
         keep_to_guide(learner, 0.1)
@@ -148,7 +147,7 @@ def test_a_selector_near_its_guide_learns_where_its_state_is_and_is_kept_on_the_
 @pytest.mark.parametrize("name", OFF)
 def test_algorithms_of_replay_learn_and_act_where_their_state_is(name):
     config, space = OFF[name]
-    algorithm: Any = make_algorithm(config, SEEN, space)
+    algorithm = make_algorithm(config, SEEN, space)
     lead, n = (P, B), config.n_step if isinstance(config, SAC) else 1
     free = torch.ones(P, B, 3, dtype=torch.bool) if space is LINE else None
     batch = Sample(
@@ -168,7 +167,7 @@ def test_algorithms_of_replay_learn_and_act_where_their_state_is(name):
         assert_acts(algorithm, state, mode, batch.obs, None)
 
 
-def assert_acts(algorithm: Any, state: Any, mode: Any, obs: Any, memory: Any) -> None:
+def assert_acts(algorithm, state, mode, obs, memory):
     """It acts on the device of what it is given; unless told otherwise that is the CPU."""
     noise = algorithm.noise([Seeds(m).torch() for m in range(P)], 1, B)[0]
     for device in (torch.device("cpu"), THERE):
@@ -182,7 +181,7 @@ def assert_acts(algorithm: Any, state: Any, mode: Any, obs: Any, memory: Any) ->
 
 
 def test_what_an_update_draws_is_moved_to_the_batch():
-    algorithm: Any = make_algorithm(SAC(**SMALL), SEEN, FORCE)
+    algorithm = make_algorithm(SAC(**SMALL), SEEN, FORCE)
     state, seen = algorithm.init([Seeds(0)]), []
     algorithm.learn = lambda state, batch, rate, noise, due: seen.extend(noise) or ({}, None)
     zeros = torch.zeros(1, B, device="meta")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ P, B, A = 2, 7, 3
 LINEAR = DQN(num_envs=2, network=Network(()), loss="mse", learning_rate=1e-2)
 
 
-def make(config: DQN = LINEAR, members: int = P, **settings: Any) -> tuple[DQNAlgorithm, State]:
+def make(config: DQN = LINEAR, members: int = P, **settings) -> tuple[DQNAlgorithm, State]:
     algorithm = DQNAlgorithm(replace(config, **settings), Box(-1, 1, (2,)), Discrete(A))
     state = algorithm.init([Seeds(m) for m in range(members)])
     g = torch.Generator().manual_seed(1)
@@ -33,7 +32,7 @@ def sample(members: int = P, masked: bool = False, weighted: bool = False) -> Sa
     return transitions(Discrete(A), (members, B), 2, masked=masked, weighted=weighted)
 
 
-def linear(algorithm: DQNAlgorithm, flat: torch.Tensor, member: int, obs: torch.Tensor) -> Any:
+def linear(algorithm: DQNAlgorithm, flat: torch.Tensor, member: int, obs: torch.Tensor):
     views = algorithm.layout.views(flat)
     return obs @ views["q.0.weight"][member] + views["q.0.bias"][member, 0]
 
@@ -183,7 +182,7 @@ def test_rainbow_has_every_extension_and_settings_override():
 class Pays(Toy):
     """Each action pays thousands, the second the most."""
 
-    def play(self, action: Any) -> Any:
+    def play(self, action):
         still = np.zeros((self.num_envs, 1), np.float32)
         return still, 4000.0 + 2000.0 * action, self.never, self.never
 

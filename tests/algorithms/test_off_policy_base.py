@@ -1,7 +1,5 @@
 """What the algorithms of a replay buffer share, and their settings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +26,7 @@ from skillweave.networks.config import CNN, RNN, Network
 from skillweave.spaces import obs_codec
 
 NAN = float("nan")
-TOGETHER: list[tuple[type, str, object, str]] = [
+TOGETHER = [
     *((kind, "buffer_size", 15, r"at least 16 \(num_envs·\(n_step\+1\)\)") for kind in (DQN,)),
     (TD3, "buffer_size", 31, r"at least 32 \(num_envs·\(n_step\+1\)\)"),
     *((kind, "network", Network(rnn=RNN()), "without rnn: only PPO supports recurrent networks")
@@ -94,15 +92,6 @@ def test_random_forces_span_the_range_and_every_member_has_its_own():
     assert not torch.equal(drawn[0], drawn[1])
     alone = algorithm.random_actions([Seeds(1).torch()], 5000, None)
     assert torch.equal(alone[0], drawn[1])
-
-
-def test_the_rate_is_constant_or_falls_to_nothing():
-    for schedule, rates in (("constant", [0.1] * 3), ("linear", [0.1, 0.05, 0.0])):
-        config = DQN(learning_rate=0.1, learning_rate_schedule=schedule)
-        algorithm = make_algorithm(config, Discrete(2), Discrete(2))
-        state = algorithm.init([Seeds(0)])
-        found = [algorithm.rate(state, p).item() for p in (0.0, 0.5, 1.0)]
-        assert found == pytest.approx(rates)
 
 
 def test_critics_of_a_member_differ_and_do_not_depend_on_its_neighbours():

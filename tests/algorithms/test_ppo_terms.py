@@ -61,10 +61,6 @@ def test_who_acts_has_the_floor_and_who_is_greedy_has_not():
 def test_a_floor_needs_discrete_actions():
     with pytest.raises(DeclarationError, match="epsilon needs discrete actions"):
         make_algorithm(PPO(epsilon=0.1), SEEN, SEEN)
-    with pytest.raises(DeclarationError, match="epsilon"):
-        PPO(epsilon=1.5)
-    with pytest.raises(DeclarationError, match="epsilon_fraction"):
-        PPO(epsilon_fraction=1.5)
 
 
 def test_divergence_of_heads_is_that_of_their_distributions():

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from toys import own_algorithm as example
+from small_runs import Balance, Left
+from toys import members_of, own_algorithm as example
 
-from skillweave import PPO, SAC, Apart, Hierarchy, Network, Skill, train_agent
+from skillweave import PPO, SAC, Apart, Hierarchy, Network, train_agent
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import Algorithm, config as table, register_algorithm
 from skillweave.algorithms.config import OnPolicy, config_from_json, config_to_json, named_config
@@ -25,14 +24,14 @@ BOX, LINE = gym.spaces.Box(-1, 1, (2,), np.float32), gym.spaces.Discrete(2)
 
 
 @pytest.fixture(autouse=True)
-def known_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+def known_afterwards(monkeypatch):
     """What a test registers is forgotten after it."""
     monkeypatch.setattr(table, "_REGISTERED", dict(table._REGISTERED))
     sys.modules.pop("own_algorithm", None)
 
 
-def own(**settings: Any) -> Any:
-    small: dict[str, Any] = {
+def own(**settings):
+    small = {
         "num_envs": 8, "n_steps": 8, "gamma": 0.5, "learning_rate": 2e-2, "normalize_obs": False,
         "network": Network((16,)), "ent_coef": 0.0,
     }  # fmt: skip
@@ -57,22 +56,12 @@ def test_a_stack_of_it_learns_what_its_members_learn_alone():
     )  # fmt: skip
     stack, _ = algorithm.update(algorithm.init([Seeds(m) for m in range(3)]), rollout, [])
     for m in range(3):
-        part = {
-            k: v[m : m + 1] if isinstance(v, torch.Tensor) else v
-            for k, v in ((k, getattr(rollout, k)) for k in rollout.__dataclass_fields__)
-        }
-        alone, _ = algorithm.update(algorithm.init([Seeds(m)]), type(rollout)(**part), [])
+        part = members_of(rollout, slice(m, m + 1))
+        alone, _ = algorithm.update(algorithm.init([Seeds(m)]), part, [])
         torch.testing.assert_close(stack.params[m], alone.params[0], rtol=1e-4, atol=1e-6)
 
 
 # From end to end
-
-
-class Left(Skill):
-    """To the left."""
-
-    def reward(self, step: Any) -> Any:
-        return -step.next_obs[:, 0]
 
 
 def test_it_trains_a_plain_agent(tmp_path):
@@ -85,7 +74,7 @@ def test_it_trains_skills_selectors_and_populations(tmp_path):
     config = own(num_envs=4, n_steps=16)
     hierarchy = Hierarchy(
         "CartPole-v1",
-        [Left(), replace_name(Left(), "again")],
+        [Left(), Balance()],
         call_steps=4,
         algorithm=config,
         selector=config,
@@ -96,17 +85,12 @@ def test_it_trains_skills_selectors_and_populations(tmp_path):
     search = Evolution(population=2, generations=2, episodes=1, mutations=changes)
     evolve = {"left": search, "selector": search}
     run = hierarchy.train(tmp_path / "run", quiet=True, evolve=evolve)
-    left, again, selector = run.info()["stages"]
-    assert [s["steps"] >= s["budget"] * 0.9 for s in (left, again, selector)] == [True] * 3
+    left, balance, selector = run.info()["stages"]
+    assert [s["steps"] >= s["budget"] * 0.9 for s in (left, balance, selector)] == [True] * 3
     assert "winner" in left
-    assert "winner" not in again
+    assert "winner" not in balance
     assert "winner" in selector
     assert run.evaluate(2).mean > 0
-
-
-def replace_name(skill: Skill, name: str) -> Skill:
-    skill.name = name
-    return skill
 
 
 # Names and files
@@ -157,14 +141,14 @@ def test_a_method_that_is_missing_is_named(method):
         getattr(algorithm, method)(*[None] * given)
 
 
-def changed(**attributes: Any) -> Any:
+def changed(**attributes):
     """Return a class like the example's, with other attributes."""
     return type("Changed", (example().A2CAlgorithm,), attributes)
 
 
-MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
+MISTAKES = {
     "no algorithm": (
-        lambda: register_algorithm(example().A2C, int),  # type: ignore[arg-type]
+        lambda: register_algorithm(example().A2C, int),
         r"int is no subclass of skillweave\.algorithms\.Algorithm",
     ),
     "settings of another store": (

@@ -1,7 +1,5 @@
 """PPO on rows that a reflex, or an earlier policy, acted in; and an anchor with a memory."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import gymnasium as gym

@@ -26,7 +26,7 @@ LINEAR = SAC(num_envs=2, network=Network(()), learning_rate=1e-2, normalize_obs=
 FORCES, CHOICES = Box(-1, 1, (2,)), Discrete(3)
 
 
-def make(space: Any, **settings: Any) -> tuple[SACAlgorithm, State]:
+def make(space, **settings) -> tuple[SACAlgorithm, State]:
     algorithm = SACAlgorithm(replace(LINEAR, **settings), Box(-1, 1, (3,)), space)
     state = algorithm.init([Seeds(m) for m in range(P)])
     g = torch.Generator().manual_seed(1)
@@ -41,7 +41,7 @@ def generators() -> list[torch.Generator]:
     return [Seeds(9 + m).torch() for m in range(P)]
 
 
-def line(views: Any, prefix: str, m: int, x: torch.Tensor) -> torch.Tensor:
+def line(views, prefix: str, m: int, x: torch.Tensor) -> torch.Tensor:
     return x @ views[f"{prefix}.0.weight"][m] + views[f"{prefix}.0.bias"][m, 0]
 
 
@@ -69,7 +69,7 @@ def losses(algorithm: SACAlgorithm, state: State, s: Sample) -> tuple[Any, Any]:
     return critic(algorithm, state, s, noise), policy
 
 
-def critic(algorithm: SACAlgorithm, state: State, s: Sample, noise: Any) -> Any:
+def critic(algorithm: SACAlgorithm, state: State, s: Sample, noise):
     params = algorithm.acting_params(state)
     target = algorithm.critic_target(state, s, params, noise)
     views = algorithm.critics.views(state.critic)
@@ -237,7 +237,7 @@ def test_the_entropy_between_n_steps_is_part_of_the_target_by_hand(space):
 class Nothing(Toy):
     """No reward, no end: the soft value of acting is α·log 2·γ/(1 − γ)."""
 
-    def play(self, action: Any) -> Any:
+    def play(self, action):
         still = np.zeros((self.num_envs, 1), np.float32)
         return still, 0.0 * self.ones, self.never, self.never
 
@@ -280,10 +280,10 @@ class TwoOfEight(Toy):
 
     action_space = Discrete(8)
 
-    def mask(self) -> Any:
+    def mask(self):
         return np.tile(np.arange(8) < 2, (self.num_envs, 1))
 
-    def play(self, action: Any) -> Any:
+    def play(self, action):
         still = np.zeros((self.num_envs, 1), np.float32)
         return still, (action == 1) * 1.0, self.t == 1, self.never
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import gymnasium as gym
 import pytest
@@ -41,7 +39,7 @@ def halving(remaining: float) -> float:
     return 1e-3 * 0.5 ** (4.0 * (1.0 - remaining))
 
 
-def closing(start: float) -> Any:
+def closing(start: float):
     def schedule(remaining: float) -> float:
         return start * remaining
 
@@ -56,9 +54,11 @@ def test_every_algorithm_follows_it_from_the_start_to_the_end_of_the_budget(kind
         assert found.tolist() == pytest.approx([want, want])
         found = rate_now(kind(learning_rate=halving), rate, progress)
         assert found.tolist() == pytest.approx([halving(1.0 - progress)] * 2)
-    number = kind(learning_rate=1e-3)
-    falls = getattr(number, "learning_rate_schedule", "linear") == "linear"
-    assert rate_now(number, rate, 0.25).tolist() == [7.0 * (0.75 if falls else 1.0)] * 2
+    for schedule, share in (("linear", 0.75), ("constant", 1.0)):
+        if kind is not SkillCritic:  # its rate always falls
+            number = kind(learning_rate=1e-3, learning_rate_schedule=schedule)
+            assert rate_now(number, rate, 0.25).tolist() == [7.0 * share] * 2
+    assert rate_now(SkillCritic(), rate, 0.25).tolist() == [7.0 * 0.75] * 2
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -101,31 +101,15 @@ def test_a_schedule_leaves_no_place_for_another_one():
 
 
 def test_a_function_is_checked_each_time_it_is_used():
-    bad = SimpleNamespace(value=1e-3)
-
-    def schedule(remaining: float) -> float:
-        return bad_values[0]
-
-    bad_values = [bad.value]
-    config = PPO(learning_rate=_named_global(schedule))
-    bad_values[0] = math.inf
+    values = [1e-3]
+    config = PPO(learning_rate=lambda remaining: values[0])
+    values[0] = math.inf
     with pytest.raises(DeclarationError, match=r"returned inf; it must return a finite number"):
         rate_now(config, torch.ones(1), 0.3)
 
 
-def _named_global(function: Any) -> Any:
-    """A schedule whose name can be recorded, whatever it reads."""
-    from skillweave._internal.named import Named
-
-    found = Named("test_schedules:changing")
-    found.function = function
-    return found
-
-
 def test_an_algorithm_of_the_users_own_that_does_not_follow_schedules_refuses_them(monkeypatch):
-    from skillweave.algorithms.ppo import PPOAlgorithm
-
-    monkeypatch.setattr(PPOAlgorithm, "follows_schedules", False)
+    monkeypatch.setattr("skillweave.algorithms.ppo.PPOAlgorithm.follows_schedules", False)
     spaces = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(2)
     with pytest.raises(DeclarationError, match="does not follow schedules: give a number"):
         make_algorithm(PPO(learning_rate=Linear(1e-3, 0)), *spaces)
@@ -167,9 +151,7 @@ def test_a_plain_agents_function_is_needed_to_resume_and_not_to_load(tmp_path, m
         run = sw.train_agent("CartPole-v1", config, 100, tmp_path / str(needs), quiet=True)
         manifest = read_manifest(run.path)
         assert (manifest.resume_needs_recipe, manifest.needs_recipe) == (needs, False)
-    from skillweave._internal import named
-
-    monkeypatch.setattr(named, "_KNOWN", {})
+    monkeypatch.setattr("skillweave._internal.named._KNOWN", {})
     agent = sw.Agent.from_manifest(as_json(manifest))
     assert agent.load(run.path).policy is not None
     with pytest.raises(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from gymnasium.spaces import Box
+from test_sac import generators
 from toys import transitions
 
 from skillweave._internal.seeding import Seeds
@@ -23,7 +23,7 @@ FORCES = Box(-1, 1, (A,))
 LINEAR = TD3(num_envs=2, network=Network(()), learning_rate=1e-2)
 
 
-def make(**settings: Any) -> tuple[TD3Algorithm, State]:
+def make(**settings) -> tuple[TD3Algorithm, State]:
     algorithm = TD3Algorithm(replace(LINEAR, **settings), Box(-1, 1, (3,)), FORCES)
     state = algorithm.init([Seeds(m) for m in range(P)])
     g = torch.Generator().manual_seed(1)
@@ -38,18 +38,14 @@ def force(algorithm: TD3Algorithm, flat: torch.Tensor, m: int, obs: torch.Tensor
     return (obs @ views["actor.0.weight"][m] + views["actor.0.bias"][m, 0]).tanh()
 
 
-def worth(algorithm: TD3Algorithm, critic: torch.Tensor, obs: Any, action: Any) -> torch.Tensor:
+def worth(algorithm: TD3Algorithm, critic: torch.Tensor, obs, action) -> torch.Tensor:
     """One critic's (D,) value."""
     views = algorithm.critics.layout.views(critic[None])
     x = torch.cat([obs, action], -1)
     return (x @ views["critic.0.weight"][0] + views["critic.0.bias"][0, 0])[..., 0]
 
 
-def generators() -> list[torch.Generator]:
-    return [Seeds(9 + m).torch() for m in range(P)]
-
-
-def critic_loss(algorithm: TD3Algorithm, state: State, s: Sample) -> Any:
+def critic_loss(algorithm: TD3Algorithm, state: State, s: Sample):
     noise = algorithm.learning_noise(generators(), B, False)
     target = algorithm.critic_target(state, s, ActingParams({}, None, None), noise)
     q = algorithm.critics.chosen(algorithm.critics.views(state.critic), {"vector": s.obs}, s.action)

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
+from small_runs import Balance, Left
 from toys import Echo, learn
 
-from skillweave import Apart, Hierarchy, Skill, TrainDefaults
+from skillweave import Apart, Hierarchy, TrainDefaults
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.config import DQN, PPO, SAC, TD3, AlgorithmConfig
+from skillweave.algorithms.config import DQN, PPO, SAC, TD3
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.evolution import Evolution
 from skillweave.networks.config import CNN, RNN, Network
@@ -39,23 +40,28 @@ def one_thread_afterwards() -> Iterator[None]:
     torch.set_num_threads(1)
 
 
+def of_each_count(make):
+    """What is made with each number of threads, which the caller has again afterwards."""
+    found = []
+    for count in COUNTS:
+        torch.set_num_threads(count)
+        found.append(make(count))
+        assert torch.get_num_threads() == count
+    return found
+
+
 @pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", INITIAL)
 def test_initial_weights_do_not_depend_on_the_number_of_threads(name):
     config = INITIAL[name]
     acts = Discrete(4) if isinstance(config, PPO | DQN) else Box(-1.0, 1.0, (2,), np.float32)
-    drawn = []
-    for count in COUNTS:
-        torch.set_num_threads(count)
-        state = make_algorithm(config, SEEN, acts).init([Seeds(0), Seeds(1)])
-        assert torch.get_num_threads() == count  # the caller's, given back
-        drawn.append({k: v for k, v in vars(state).items() if isinstance(v, torch.Tensor)})
-    for other in drawn[1:]:
-        assert all(torch.equal(value, other[k]) for k, value in drawn[0].items())
+    algorithm = make_algorithm(config, SEEN, acts)
+    first, *others = of_each_count(lambda _: vars(algorithm.init([Seeds(0), Seeds(1)])))
+    for other in others:
+        assert all(torch.equal(value, other[k]) for k, value in first.items())
 
 
 BUFFERED = {"num_envs": 8, "learning_starts": 64, "batch_size": 64, "network": WIDE}
-BUDGET = 192
 LEARNERS = {
     "PPO": (PPO(num_envs=8, n_steps=16, batch_size=64, network=WIDE), "Discrete"),
     "DQN": (DQN(**BUFFERED, train_freq=1), "Discrete"),
@@ -67,34 +73,16 @@ LEARNERS = {
 @pytest.mark.parametrize("name", LEARNERS)
 def test_training_does_not_depend_on_the_number_of_threads(name):
     config, asks = LEARNERS[name]
-
-    def params() -> torch.Tensor:
-        return learn(config, Echo(8, "vector", asks), BUDGET)[1].params
-
-    found = []
-    for count in COUNTS:
-        torch.set_num_threads(count)
-        found.append(params())
-    assert torch.equal(found[0], found[1])
-    assert torch.equal(found[0], found[2])
-
-
-class Left(Skill):
-    def reward(self, step):
-        return -step.next_obs[:, 0]
-
-
-class Upright(Skill):
-    def reward(self, step):
-        return 1.0 - np.abs(step.next_obs[:, 2])
+    first, *others = of_each_count(lambda _: learn(config, Echo(8, "vector", asks), 192)[1].params)
+    assert all(torch.equal(first, other) for other in others)
 
 
 def trained(path: Path) -> dict[str, bytes]:
     """Every policy's file of a small hierarchy, one skill of which is evolved."""
-    algorithm: AlgorithmConfig = PPO(num_envs=4, n_steps=16, batch_size=32, network=WIDE)
+    algorithm = PPO(num_envs=4, n_steps=16, batch_size=32, network=WIDE)
     hierarchy = Hierarchy(
         "CartPole-v1",
-        [Left(), Upright()],
+        [Left(), Balance()],
         call_steps=4,
         algorithm=algorithm,
         selector=algorithm,
@@ -112,11 +100,7 @@ def trained(path: Path) -> dict[str, bytes]:
 
 @pytest.mark.slow
 def test_a_hierarchy_does_not_depend_on_the_number_of_threads(tmp_path):
-    found = []
-    for count in COUNTS:
-        torch.set_num_threads(count)
-        found.append(trained(tmp_path / str(count)))
-        assert torch.get_num_threads() == count
+    found = of_each_count(lambda count: trained(tmp_path / str(count)))
     assert found[0] == found[1] == found[2]
 
 

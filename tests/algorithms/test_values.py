@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
+from test_sac import critics, line
 from torch.distributions import Categorical
 
 from skillweave._internal.seeding import Seeds
@@ -16,12 +17,12 @@ from skillweave.algorithms.registry import make_algorithm
 from skillweave.networks.config import RNN, Network
 
 P, B, A = 2, 5, 3
-LINE: dict[str, Any] = {"network": Network(()), "normalize_obs": False}
+LINE = {"network": Network(()), "normalize_obs": False}
 X = torch.randn(P, B, 2, generator=torch.Generator().manual_seed(0))
 MASK = torch.tensor([True, False, True]).expand(P, B, A)
 
 
-def made(config: Any, space: Any) -> tuple[Any, Any]:
+def made(config, space) -> tuple[Any, Any]:
     algorithm = make_algorithm(config, Box(-1, 1, (2,)), space)
     state = algorithm.init([Seeds(m) for m in range(P)])
     g = torch.Generator().manual_seed(1)
@@ -35,18 +36,12 @@ def made(config: Any, space: Any) -> tuple[Any, Any]:
     return algorithm, state
 
 
-def line(views: Any, name: str, x: torch.Tensor, m: int) -> torch.Tensor:
-    return x @ views[f"{name}.weight"][m] + views[f"{name}.bias"][m, 0]
-
-
-def critics(algorithm: Any, state: Any, m: int, *parts: torch.Tensor) -> torch.Tensor:
+def smaller(algorithm, state, m: int, *parts: torch.Tensor) -> torch.Tensor:
     """The smaller of two critics, (B, out)."""
-    views = algorithm.critics.layout.views(state.critic[m])
-    x = torch.cat(parts, -1)
-    return torch.minimum(line(views, "critic.0", x, 0), line(views, "critic.0", x, 1))
+    return critics(algorithm, state.critic, m, torch.cat(parts, -1)).min(0).values
 
 
-def assert_worth(algorithm: Any, state: Any, mask: Any, expected: list[torch.Tensor]) -> None:
+def assert_worth(algorithm, state, mask, expected: list[torch.Tensor]):
     found = algorithm.value(state, X, mask)
     assert found.shape == (P, B)
     torch.testing.assert_close(found, torch.stack(expected), rtol=1e-4, atol=1e-5)
@@ -55,7 +50,7 @@ def assert_worth(algorithm: Any, state: Any, mask: Any, expected: list[torch.Ten
 def test_ppos_is_its_critics_in_units_of_reward():
     algorithm, state = made(PPO(**LINE), Discrete(A))
     views = algorithm.layout.views(state.params)
-    raw = [line(views, "critic.0", X[m], m)[:, 0] for m in range(P)]
+    raw = [line(views, "critic", m, X[m])[:, 0] for m in range(P)]
     assert_worth(algorithm, state, None, [2.0 * raw[0] + 3.0, 3.0 * raw[1] - 1.0])
 
 
@@ -75,7 +70,7 @@ def test_dqns_is_the_best_allowed_action(mask, scaled):
     views, units = algorithm.layout.views(state.params), [2.0, 3.0] if scaled else [1.0, 1.0]
     expected = []
     for m in range(P):
-        q = line(views, "q.0", X[m], m)
+        q = line(views, "q", m, X[m])
         allowed = q if mask is None else q[:, [0, 2]]
         expected.append(units[m] * allowed.max(-1).values)
     assert_worth(algorithm, state, mask, expected)
@@ -91,7 +86,7 @@ def test_of_c51_it_is_the_mean_of_the_best_allowed_actions_distribution(bounds):
     units = [math.sqrt(13), math.sqrt(10)] if bounds[0] is None else [1.0, 1.0]
     views, expected = algorithm.layout.views(state.params), []
     for m in range(P):
-        p = line(views, "q.0", X[m], m).view(B, A, 4).softmax(-1)
+        p = line(views, "q", m, X[m]).view(B, A, 4).softmax(-1)
         expected.append(units[m] * (p @ atoms)[:, [0, 2]].max(-1).values)
     assert_worth(algorithm, state, MASK, expected)
 
@@ -102,9 +97,9 @@ def test_sacs_of_discrete_actions_is_the_soft_value(mask):
     algorithm, state = made(config, Discrete(A))
     views, expected = algorithm.layout.views(state.params), []
     for m in range(P):
-        logits = line(views, "actor.0", X[m], m)
+        logits = line(views, "actor", m, X[m])
         law = Categorical(logits=logits if mask is None else logits.masked_fill(~mask[m], -1e9))
-        q = critics(algorithm, state, m, X[m])
+        q = smaller(algorithm, state, m, X[m])
         soft = (law.probs * q).sum(-1) + 0.3 * law.entropy()
         expected.append((2.0, 3.0)[m] * soft)
     assert_worth(algorithm, state, mask, expected)
@@ -114,11 +109,11 @@ def test_sacs_of_continuous_actions_is_the_greedy_ones_with_the_entropy():
     algorithm, state = made(SAC(**LINE, ent_coef=0.3), Box(-1, 1, (2,)))
     views, expected = algorithm.layout.views(state.params), []
     for m in range(P):
-        mean, log_std = line(views, "actor.0", X[m], m).chunk(2, -1)
+        mean, log_std = line(views, "actor", m, X[m]).chunk(2, -1)
         action = mean.tanh()
         spread = log_std.clamp(-5, 2) + 0.5 * math.log(2 * math.pi * math.e)
         entropy = (spread + (1 - action.square()).log()).sum(-1)
-        expected.append(critics(algorithm, state, m, X[m], action)[:, 0] + 0.3 * entropy)
+        expected.append(smaller(algorithm, state, m, X[m], action)[:, 0] + 0.3 * entropy)
     assert_worth(algorithm, state, None, expected)
 
 
@@ -126,6 +121,6 @@ def test_td3s_is_the_smaller_critics_of_its_own_action():
     algorithm, state = made(TD3(**LINE, normalize_rewards=True), Box(-1, 1, (2,)))
     views, expected = algorithm.layout.views(state.params), []
     for m in range(P):
-        action = line(views, "actor.0", X[m], m).tanh()
-        expected.append((2.0, 3.0)[m] * critics(algorithm, state, m, X[m], action)[:, 0])
+        action = line(views, "actor", m, X[m]).tanh()
+        expected.append((2.0, 3.0)[m] * smaller(algorithm, state, m, X[m], action)[:, 0])
     assert_worth(algorithm, state, None, expected)

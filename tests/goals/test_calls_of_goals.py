@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from goals.worlds import Rest, aim_of, declared, go_to, place_of
@@ -15,29 +13,29 @@ from skillweave.planning import CallLog, join
 from skillweave.skills.goals import goals_of
 
 
-def walk(self: Any, obs: Any, goal: Any) -> Any:
+def walk(self, obs, goal):
     """Go to a goal that is a box, straight."""
     return np.clip(5 * (aim_of(goal) - place_of(obs)), -1, 1).astype(np.float32)
 
 
-def rests(obs: Any) -> Any:
+def rests(obs):
     """A selector that never calls a skill with goals."""
     return np.full(len(obs), "rest")
 
 
-def ready(space: str = "box", **how: Any) -> sw.Run:
+def ready(space: str = "box", **how) -> sw.Run:
     """A run of a ready skill with goals, and one without."""
     skills = [go_to(space, policy=walk), Rest()]
     return declared(skills, **({"selector": rests} | how)).train(quiet=True)
 
 
-def two_goals(obs: Any) -> Any:
+def two_goals(obs):
     """A selector: to a corner where the point is left, else rest."""
     left = obs[:, 0] < 0
     return np.where(left, "go_to", "rest"), np.full((len(obs), 2), 0.75)
 
 
-def test_random_calls_have_goals_as_for_practice() -> None:
+def test_random_calls_have_goals_as_for_practice():
     log = ready().log_calls(600, num_envs=4)
     mine = log.skill == 0
     assert 10 < mine.sum() < len(log)
@@ -51,14 +49,14 @@ def test_random_calls_have_goals_as_for_practice() -> None:
 
 
 @pytest.mark.parametrize("space", ["number", "dict", "tuple", "bits"])
-def test_goals_of_other_kinds(space: str) -> None:
+def test_goals_of_other_kinds(space):
     log = ready(space).log_calls(200, num_envs=2)
     sizes = {"number": 1, "dict": 3, "tuple": 3, "bits": 2}
     assert log.goals["go_to"].shape == (len(log), sizes[space])
     assert log.succeeded[log.skill == 0].any()
 
 
-def test_a_selector_gives_the_goals(tmp_path: Any) -> None:
+def test_a_selector_gives_the_goals(tmp_path):
     run = ready(selector=two_goals)
     log = run.log_calls(300, choose=two_goals, num_envs=2)
     assert (log.goals["go_to"][log.skill == 0] == 0.75).all()
@@ -76,7 +74,7 @@ def test_a_selector_gives_the_goals(tmp_path: Any) -> None:
     assert len(log.of("go_to").goals["go_to"]) == (log.skill == 0).sum()
 
 
-def test_training_logs_goals() -> None:
+def test_training_logs_goals():
     selector = sw.PPO(num_envs=2, n_steps=16, batch_size=8, update_epochs=1)
     hierarchy = declared([go_to(policy=walk), Rest()], selector=selector)
     run = hierarchy.train(log_calls=400, quiet=True)
@@ -86,7 +84,7 @@ def test_training_logs_goals() -> None:
     np.testing.assert_array_equal(log.succeeded[mine], near)
 
 
-def test_a_report_shows_calls_of_skills_with_goals(tmp_path: Any) -> None:
+def test_a_report_shows_calls_of_skills_with_goals(tmp_path):
     selector = sw.PPO(num_envs=2, n_steps=16, batch_size=8, update_epochs=1)
     run = declared([go_to(policy=walk), Rest()], selector=selector).train(quiet=True)
     found = run.report(tmp_path / "report.html", episodes=2)
@@ -95,7 +93,7 @@ def test_a_report_shows_calls_of_skills_with_goals(tmp_path: Any) -> None:
 
 
 @pytest.mark.parametrize("space", ["box", "dict"])
-def test_a_skill_with_goals_rehearses_observations_and_goals(space: str) -> None:
+def test_a_skill_with_goals_rehearses_observations_and_goals(space):
     log = ready(space).log_calls(200, num_envs=2)
     skill = go_to(space)
     seen = rehearsed_obs(log, skill, None, "rest", None)
@@ -112,7 +110,7 @@ def test_a_skill_with_goals_rehearses_observations_and_goals(space: str) -> None
         assert (*log.start[call], *log.goals["go_to"][call]) in pairs
 
 
-def test_logs_with_other_goals_are_not_joined() -> None:
+def test_logs_with_other_goals_are_not_joined():
     log = ready().log_calls(100, num_envs=2)
     other = ready("bits").log_calls(100, num_envs=2)
     with pytest.raises(RunError):

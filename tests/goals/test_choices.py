@@ -1,7 +1,5 @@
 """Choices of a skill and its goal: their space, their numbers, and their distribution."""
 
-from __future__ import annotations
-
 import math
 
 import gymnasium as gym

@@ -22,10 +22,10 @@ from skillweave.skills.goals import goals_of
 from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Step
 
-TOGETHER: Any = {"selector": SELECTOR, "learn": "together", "train_defaults": OFTEN}
+TOGETHER = {"selector": SELECTOR, "learn": "together", "train_defaults": OFTEN}
 
 
-def random_critic(space: Any, goals: dict[str, Any], **how: Any) -> AgentPolicy:
+def random_critic(space, goals: dict[str, Any], **how) -> AgentPolicy:
     seen = with_goal(space, gym.spaces.Dict(list(goals.items())))
     settings = SkillCritic(network=SMALL, sees_goals=True, deciding=True, normalize_obs=False)
     algorithm = make_algorithm(settings, seen, gym.spaces.Discrete(2))

@@ -1,7 +1,5 @@
 """A skill with goals is scored, filmed and shown for one goal, or for goals that it draws."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

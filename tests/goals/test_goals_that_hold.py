@@ -1,9 +1,5 @@
 """Goals for which a call would end at once: they are chosen again."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 from goals.worlds import ON, GoTo, Point, declared, go_to
 
@@ -45,7 +41,7 @@ def test_goals_that_hold_are_drawn_again_in_practice():
 class Middle(Point):
     """Starts at 0."""
 
-    def reset(self, **how: Any) -> Any:
+    def reset(self, **how):
         super().reset(**how)
         self.place = np.zeros(2, np.float32)
         return self._obs(), {}

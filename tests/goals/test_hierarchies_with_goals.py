@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from small_runs import goes_on
@@ -36,7 +34,7 @@ def outer_goals(obs):
     return np.full(len(obs), "far"), np.where(obs[:, :1] > 0, 0.7, 0.1) * np.ones((1, 2))
 
 
-def far(inner: Any, space: str = "box", **attributes: Any) -> sw.Skill:
+def far(inner, space: str = "box", **attributes) -> sw.Skill:
     """A hierarchy as a skill with goals."""
     methods = {"name": "far", "policy": inner, "goal_space": SPACES[space], "max_steps": 9}
     return type("Far", (GoTo,), methods | attributes)()

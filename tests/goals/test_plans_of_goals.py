@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -19,13 +17,13 @@ from skillweave.planning.graph import CallGraph
 from skillweave.skills.goal_spaces import choice_space
 
 GAMMA = 0.9
-LINE: Any = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+LINE = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
 
 
 def near(*place: float) -> Predicate:
     """The predicate that the point is at a place."""
 
-    def there(obs: Any) -> Any:
+    def there(obs):
         return np.abs(obs - np.float32(place)).max(1) < 0.3
 
     return Predicate(there, f"near {place}", "obs")
@@ -34,7 +32,7 @@ def near(*place: float) -> Predicate:
 MISSION = Mission(near(1.4, 0.3), near(0.3, 1.4))
 
 
-def jumps(goals: Any, starts: Any = range(11)) -> CallLog:
+def jumps(goals, starts=range(11)) -> CallLog:
     """A log of one skill with goals: from each start it goes three steps towards each goal."""
     calls, given = [], []
     for start in starts:
@@ -47,14 +45,14 @@ def jumps(goals: Any, starts: Any = range(11)) -> CallLog:
     return log
 
 
-def bound(planner: Planner, space: Any) -> Planner:
+def bound(planner: Planner, space) -> Planner:
     """The planner for a skill ``go`` with goals of a space."""
     choices = choice_space(1, {"go": space}, ["go"])
     return planner.among(("go",)).bind(planner.log.observation_space, choices, "selector")
 
 
 @pytest.mark.parametrize("goals", [(0, 10), range(11)])
-def test_values_are_those_of_a_skill_for_each_goal(goals: Any) -> None:
+def test_values_are_those_of_a_skill_for_each_goal(goals):
     """With few goals and with many: the best goal from each start is known on a line."""
     log = jumps(goals, np.repeat(np.arange(11), 3))  # every call three times
     planner = Planner(log, Mission(at(9), at(1)), neighbors=1, gamma=GAMMA, caution=0.0)
@@ -72,7 +70,7 @@ def test_values_are_those_of_a_skill_for_each_goal(goals: Any) -> None:
     assert aims[10] < 10
 
 
-def test_calls_count_for_one_another_by_start_and_goal() -> None:
+def test_calls_count_for_one_another_by_start_and_goal():
     """At the same start, the goal that leads to 5 is worth most, and near goals a part of it."""
     goals = np.linspace(-1, 1, 40)
     ends = np.where(goals > 0.5, 5, -5)
@@ -88,7 +86,7 @@ def test_calls_count_for_one_another_by_start_and_goal() -> None:
     assert ((worth > 0.01) & (worth < 0.99)).any()  # beside the edge, where a neighbor differs
 
 
-def test_fewer_calls_than_options() -> None:
+def test_fewer_calls_than_options():
     """Options without a call are worth nothing, and are never chosen."""
     log = log_of(["go"], [(p, [(0, [p + 1], True, "end")]) for p in range(5)])
     log.goals["go"] = np.arange(1.0, 6.0)[:, None]
@@ -102,7 +100,7 @@ def test_fewer_calls_than_options() -> None:
     assert choice["goal"]["go"][1, 0] == 1
 
 
-def test_goals_of_a_log_of_which_every_so_many_th_call_counts(monkeypatch: Any) -> None:
+def test_goals_of_a_log_of_which_every_so_many_th_call_counts(monkeypatch):
     monkeypatch.setattr("skillweave.planning.graph.MOST_CALLS", 50)
     log = jumps((0, 10), np.repeat(np.arange(11), 20))
     obs = np.float32([[2], [7]])
@@ -115,7 +113,7 @@ def test_goals_of_a_log_of_which_every_so_many_th_call_counts(monkeypatch: Any) 
     assert aims == [[10, 10], [0, 0]]
 
 
-def test_a_logged_goal_has_no_distance_to_itself() -> None:
+def test_a_logged_goal_has_no_distance_to_itself():
     """Not even by rounding, where its numbers are large beside their differences."""
     log = log_of(["go"], [(0, [(0, [i], True, "end")]) for i in range(40)])
     log.goals["go"] = np.random.default_rng(0).normal(size=(40, 2))
@@ -123,7 +121,7 @@ def test_a_logged_goal_has_no_distance_to_itself() -> None:
     assert (near.distance == 0).all()
 
 
-def test_a_goal_that_failed_is_not_repeated_forever() -> None:
+def test_a_goal_that_failed_is_not_repeated_forever():
     """The log says that goals above lead to 3; now there is a wall."""
     log = jumps((0, 10), np.repeat(np.arange(11), 3))
     planner = bound(Planner(log, at(9), neighbors=1, gamma=GAMMA), LINE)
@@ -131,7 +129,7 @@ def test_a_goal_that_failed_is_not_repeated_forever() -> None:
 
 
 @pytest.mark.slow
-def test_a_mission_of_places_that_no_training_saw() -> None:
+def test_a_mission_of_places_that_no_training_saw():
     run = ready()
     log = run.log_calls(4_000, num_envs=8)
     planned = run.plan(MISSION, log)
@@ -142,7 +140,7 @@ def test_a_mission_of_places_that_no_training_saw() -> None:
 
 
 @pytest.mark.slow
-def test_a_planner_is_declared_as_a_selector() -> None:
+def test_a_planner_is_declared_as_a_selector():
     run = ready()
     log = run.log_calls(1_500, num_envs=8)
     skills = run.hierarchy.skills
@@ -155,7 +153,7 @@ def test_a_planner_is_declared_as_a_selector() -> None:
     assert np.mean(arrived) >= 0.9
 
 
-def test_another_log_s_goals_are_refused() -> None:
+def test_another_log_s_goals_are_refused():
     log = ready().log_calls(300, num_envs=4)
     run = ready("number")
     with pytest.raises(RunError, match="changed since the log"):
@@ -165,7 +163,7 @@ def test_another_log_s_goals_are_refused() -> None:
         other.train(quiet=True)
 
 
-def test_a_guide_of_one_skill_with_goals_is_refused() -> None:
+def test_a_guide_of_one_skill_with_goals_is_refused():
     skills = [go_to(policy=ready().hierarchy.skills[0].policy)]
     run = declared(skills).train(quiet=True)
     log = run.log_calls(300, num_envs=4)
@@ -181,7 +179,7 @@ def test_a_guide_of_one_skill_with_goals_is_refused() -> None:
         *(pytest.param(x, marks=pytest.mark.slow) for x in ("numbers", "dict", "tuple", "bits")),
     ],
 )
-def test_plans_with_goals_of_other_kinds(space: str) -> None:
+def test_plans_with_goals_of_other_kinds(space):
     run = ready(space)
     log = run.log_calls(1_500, num_envs=8)
     mine = log.end[log.succeeded & (log.skill == 0)]
@@ -190,7 +188,7 @@ def test_plans_with_goals_of_other_kinds(space: str) -> None:
     assert np.mean(np.array(found.returns) > 0.99) >= 0.8
 
 
-def test_exploring_draws_goals_for_new_calls() -> None:
+def test_exploring_draws_goals_for_new_calls():
     run = ready()
     log = run.log_calls(600, choose=Explorer(every=150), num_envs=4)
     mine = log.skill == 0
@@ -199,7 +197,7 @@ def test_exploring_draws_goals_for_new_calls() -> None:
     assert 10 < len(np.unique(log.goals["go_to"][mine], axis=0)) < mine.sum()
 
 
-def test_handover_and_chains_go_by_skill() -> None:
+def test_handover_and_chains_go_by_skill():
     log = ready().log_calls(1_000, num_envs=4)
     rate, count = log.handover().of("go_to", after="go_to")
     assert 0 < rate <= 1
@@ -208,7 +206,7 @@ def test_handover_and_chains_go_by_skill() -> None:
 
 
 @pytest.mark.slow
-def test_lengths_are_chosen_with_goals() -> None:
+def test_lengths_are_chosen_with_goals():
     run = ready(selector=sw.PPO(num_envs=2, n_steps=16, batch_size=8, update_epochs=1),
                 call_steps=sw.Lengths(2, 4, 8))  # fmt: skip
     log = run.log_calls(4_000, num_envs=8)
@@ -217,7 +215,7 @@ def test_lengths_are_chosen_with_goals() -> None:
     assert np.mean(np.array(found.returns) > 0.99) >= 0.9
 
 
-def test_a_skill_with_goals_that_was_never_called_is_not_chosen() -> None:
+def test_a_skill_with_goals_that_was_never_called_is_not_chosen():
     run = ready()
     log = run.log_calls(300, num_envs=4)
     rests = log.take(np.flatnonzero(log.skill == 1))
@@ -227,7 +225,7 @@ def test_a_skill_with_goals_that_was_never_called_is_not_chosen() -> None:
 
 
 @pytest.mark.slow
-def test_a_trained_selector_starts_from_a_plan_with_goals() -> None:
+def test_a_trained_selector_starts_from_a_plan_with_goals():
     run = ready()
     log = run.log_calls(3_000, num_envs=8, seed=1)
     planned = run.plan(near(1.4, 0.3), log)
@@ -246,16 +244,16 @@ def test_a_trained_selector_starts_from_a_plan_with_goals() -> None:
     assert again.evaluate(3, quiet=True).returns == trained.evaluate(3, quiet=True).returns
 
 
-def of_its_goal(step: Any) -> Any:
+def of_its_goal(step):
     return np.abs(step.next_obs - step.goal).max(1) < 0.3
 
 
-def of_a_part_of_its_goal(step: Any) -> Any:
+def of_a_part_of_its_goal(step):
     return step.goal[:, 0] > 0
 
 
 @pytest.mark.parametrize("task", ["go_to", of_its_goal, of_a_part_of_its_goal])
-def test_a_task_knows_no_goal(task: Any) -> None:
+def test_a_task_knows_no_goal(task):
     run = ready()
     log = run.log_calls(200)
     with pytest.raises(SkillError, match=r"step\.goal: that is None here, .* write the predicate"):
@@ -268,9 +266,7 @@ def test_a_task_knows_no_goal(task: Any) -> None:
 @pytest.mark.parametrize(
     ("as_dict", "sees"), [(False, (1, 0, "goal")), (True, ("observation.place", "goal"))]
 )
-def test_calls_are_compared_by_the_numbers_of_the_observation_that_a_network_sees(
-    as_dict: bool, sees: Any
-) -> None:
+def test_calls_are_compared_by_the_numbers_of_the_observation_that_a_network_sees(as_dict, sees):
     algorithm = sw.PPO(num_envs=4, n_steps=16, network=sw.Network((8,), sees=sees))
     env = sw.EnvSpec(lambda: Point(as_dict=as_dict), engine="sync", workers=1)
     run = declared([go_to(algorithm=algorithm), Rest()], env=env, steps=64).train(quiet=True)
@@ -282,7 +278,7 @@ def test_calls_are_compared_by_the_numbers_of_the_observation_that_a_network_see
 
 
 @pytest.mark.parametrize("declares", [{"sees": (1, 0)}, {"policy": sw.Residual(lambda o: -o)}])
-def test_calls_of_a_part_or_a_correction_are_compared_by_all(declares: Any) -> None:
+def test_calls_of_a_part_or_a_correction_are_compared_by_all(declares):
     algorithm = sw.PPO(num_envs=4, n_steps=16, network=sw.Network((8,), sees=(0,)))
     own = type("Own", (sw.Skill,), {"algorithm": algorithm, "max_steps": 3, **declares})
     rule = {"selector": lambda obs: ["own"] * len(obs)}

@@ -1,7 +1,5 @@
 """Selectors give goals: rules, automata and trees, and selectors that learn."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -75,6 +73,7 @@ def test_goals_are_those_that_the_selector_gave():
 SPACE_NAMES = [name for name in SPACES if name != "picture"]
 
 
+@pytest.mark.fast_cases(2 * len(SPACE_NAMES))
 @pytest.mark.parametrize("space", SPACE_NAMES)
 @pytest.mark.parametrize("learn", ["apart", "together", "apart, then together"])
 def test_a_selector_learns_skill_and_goal(space, learn):
@@ -86,6 +85,7 @@ def test_a_selector_learns_skill_and_goal(space, learn):
     run.evaluate(3, deterministic=False)
 
 
+@pytest.mark.fast_cases(4)
 @pytest.mark.parametrize("learn", ["apart", "together"])
 @pytest.mark.parametrize("space", ["box", "number", "numbers"])
 def test_an_interrupted_run_ends_with_the_same_weights(learn, space, tmp_path):
@@ -116,7 +116,7 @@ def test_chosen_lengths_and_goals():
     run.evaluate(3, deterministic=False)
 
 
-@pytest.mark.parametrize("space", ["number", "numbers", "bits", "whole"])
+@pytest.mark.fast_cases(6)
 @pytest.mark.parametrize(
     "selector",
     [
@@ -126,6 +126,7 @@ def test_chosen_lengths_and_goals():
     ],
     ids=["DQN", "Rainbow", "SAC"],
 )
+@pytest.mark.parametrize("space", ["number", "numbers", "bits", "whole"])
 def test_a_selector_with_values_chooses_discrete_goals(selector, space, tmp_path):
     class Sometimes(Rest):
         def initiation(self, obs):
@@ -165,11 +166,13 @@ def test_algorithms_say_which_goals_they_cannot_choose(selector, space, says):
         (lambda obs: (np.full(len(obs), "rest"), {"rest": obs}), "which has no goals"),
         (sw.Automaton({"a": "go_to"}, {}), r"without a goal .*write \('go_to', goal\)"),
         (sw.tree.Sequence(("go_to", (1.0, 2.0, 3.0))), "gave goals of shape"),
+        (sw.Automaton({"a": ("go_to", (0.5, (0.5, 1)))}, {}), "which are no goals of Box"),
+        (sw.Automaton({"a": ("go_to", lambda obs: None)}, {}), "returned None, but goals"),
     ],
 )
 def test_a_goal_that_is_not_right(selector, says):
     with pytest.raises(SkillError, match=says):
-        declared([go_to(), Rest()], selector=selector).train(quiet=True).evaluate(2)
+        evaluated(selector, SPACES["box"])
 
 
 def test_goals_for_skills_without_goals():
@@ -247,15 +250,19 @@ def test_spaces_of_goals():
         declared([type("GoTo", (sw.Skill,), {"goal_space": graph})()]).check_spaces()
 
 
-def evaluated(selector, space):
-    """Evaluate a selector of a skill with goals of a space."""
+def skill_of(space):
+    """A skill with goals of a space."""
     skill = go_to()
     type(skill).goal_space = space
     if space.shape is None:
         type(skill).reward = lambda self, step: step.goal["at"].sum(1)
-        type(skill).termination = lambda self, step: step.goal["at"].sum(1) > 9
-        type(skill).success = lambda self, step: step.goal["at"].sum(1) > 9
-    hierarchy = declared([skill, Rest()], selector=selector)
+        type(skill).termination = type(skill).success = lambda self, step: step.goal["at"][:, 0] > 9
+    return skill
+
+
+def evaluated(selector, space):
+    """Evaluate a selector of a skill with goals of a space."""
+    hierarchy = declared([skill_of(space), Rest()], selector=selector)
     return hierarchy.train(quiet=True).evaluate(2)
 
 
@@ -299,21 +306,6 @@ def test_goals_of_other_rows_may_be_anything():
     assert len(evaluated(rule, BYTES).returns) == 2
 
 
-@pytest.mark.parametrize(
-    ("selector", "says"),
-    [
-        (
-            sw.Automaton({"a": ("go_to", (0.5, (0.5, 1)))}, {}),
-            "which are no goals of Box",
-        ),
-        (sw.Automaton({"a": ("go_to", lambda obs: None)}, {}), "returned None, but goals"),
-    ],
-)
-def test_goals_that_are_no_arrays(selector, says):
-    with pytest.raises(SkillError, match=says):
-        evaluated(selector, SPACES["box"])
-
-
 def test_goals_of_unequal_shapes():
     """Fixed goals are checked before training: those of all states, whichever come to pass."""
     selector = sw.Automaton({"a": ("go_to", HERE), "b": ("go_to", (1.0, 2.0, 3.0))}, {})
@@ -329,31 +321,22 @@ def rows_of(goal, n):
 
 
 @pytest.mark.parametrize(
-    "goals", [lambda n: rows_of(AT, n), lambda n: {"go_to": rows_of(AT, n)}], ids=["bare", "named"]
+    ("goals", "space", "wanted"),
+    [
+        (lambda obs: rows_of(AT, len(obs)), NESTED, AT),
+        (lambda obs: {"go_to": rows_of(AT, len(obs))}, NESTED, AT),
+        (lambda obs: (obs / 4, np.ones(len(obs), int)), None, {"0": 0.25, "1": 1}),
+    ],
+    ids=["bare", "named", "tuple"],
 )
-def test_a_function_gives_goals_of_a_dict(goals):
-    rule = lambda obs: (["go_to"] * len(obs), goals(len(obs)))  # noqa: E731
-    skill = go_to()
-    type(skill).goal_space = NESTED
-    type(skill).reward = lambda self, step: step.goal["at"].sum(1)
-    type(skill).termination = type(skill).success = lambda self, step: step.goal["at"][:, 0] > 9
+def test_a_function_gives_goals_of_several_parts(goals, space, wanted):
+    rule = lambda obs: (["go_to"] * len(obs), goals(obs))  # noqa: E731
+    skill = go_to("tuple") if space is None else skill_of(space)
     run = declared([skill, Rest()], selector=rule).train(quiet=True)
-    player = run.player()
-    player.act(np.zeros(2, np.float32))
-    goal = run.policy.goal_now(player.memory)
-    assert np.allclose(goal["at"], AT["at"])
-    assert goal["byte"].tolist() == [1, 2]
-
-
-def test_a_function_gives_goals_of_a_tuple():
-    rule = lambda obs: (["go_to"] * len(obs), (obs / 4, np.ones(len(obs), int)))  # noqa: E731
-    skills = [go_to("tuple"), Rest()]
-    run = declared(skills, selector=rule).train(quiet=True)
     player = run.player()
     player.act(np.ones(2, np.float32))
     goal = run.policy.goal_now(player.memory)
-    assert np.allclose(goal["0"], 0.25)
-    assert goal["1"] == 1
+    assert all(np.allclose(goal[name], part) for name, part in wanted.items())
 
 
 @pytest.mark.parametrize(

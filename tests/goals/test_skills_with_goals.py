@@ -1,7 +1,5 @@
 """One contract: a skill with goals learns by every algorithm, with goals of every kind."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np
@@ -46,6 +44,7 @@ def test_every_algorithm_learns_with_goals(name, tmp_path):
     assert loaded.evaluate(3).returns == whole.returns
 
 
+@pytest.mark.fast_cases(len(SPACES) + 2)
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("as_dict", [False, True])
 def test_goals_of_every_space(space, as_dict):

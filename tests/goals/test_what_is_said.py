@@ -1,9 +1,5 @@
 """Wrong goals are named, a goal that nothing reads is said, and goals are shown."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -36,7 +32,7 @@ def test_goals_that_are_wrong(goals, says):
         declared([go_to(goals=goals)]).train(quiet=True)
 
 
-UNSUPPORTED: dict[str, Any] = {
+UNSUPPORTED = {
     "text": (gym.spaces.Text(4), r"goal_space Text.* is not supported; supported are: Box"),
     "part": (
         gym.spaces.Dict(at=SPACES["box"], word=gym.spaces.Text(4)),
@@ -50,7 +46,7 @@ UNSUPPORTED: dict[str, Any] = {
 @pytest.mark.parametrize(("space", "says"), UNSUPPORTED.values(), ids=UNSUPPORTED)
 @pytest.mark.parametrize("learns", [True, False])
 def test_a_space_that_is_not_supported_is_named_with_its_skill(space, says, learns):
-    how: dict[str, Any] = {} if learns else {"policy": lambda self, obs, goal: obs}
+    how = {} if learns else {"policy": lambda self, obs, goal: obs}
     skill = type("GoTo", (GoTo,), {"goal_space": space, **how})()
     with pytest.raises(DeclarationError, match=f"skill 'go_to': .*{says}"):
         declared([skill]).train(quiet=True)
@@ -68,7 +64,7 @@ def test_a_space_that_is_not_supported_is_named_with_its_skill(space, says, lear
     ],
 )
 def test_goals_without_the_right_parts_are_named_with_their_skill(space, goals, says):
-    def choose(obs: Any) -> Any:
+    def choose(obs):
         return np.full(len(obs), "go_to"), goals
 
     with pytest.raises(SkillError, match=says):
@@ -103,17 +99,21 @@ class Walk(Rest):
 ZERO = np.zeros(2, np.float32)
 
 
-def test_a_player_takes_a_goal():
-    run = declared([Walk()]).train(quiet=True)
-    player = run.player(skill="go_to", goal=(0.5, -0.5))
+@pytest.fixture(scope="module")
+def walks():
+    return declared([Walk()]).train(quiet=True)
+
+
+def test_a_player_takes_a_goal(walks):
+    player = walks.player(skill="go_to", goal=(0.5, -0.5))
     assert np.allclose(player.act(ZERO), (0.5, -0.5))
     player.reset(goal=(0.25, 0.0))
     assert np.allclose(player.act(ZERO), (0.25, 0.0))
     with pytest.raises(SkillError, match=r"the player gave the goal .* out of goal_space"):
-        run.player(skill="go_to", goal=(5, 5))
+        walks.player(skill="go_to", goal=(5, 5))
     shape = r"gave a goal of shape \(1,\) for skill 'go_to', but \(2,\) was expected: one of Box"
     with pytest.raises(SkillError, match=shape):
-        run.player(skill="go_to", goal=(0.5,))
+        walks.player(skill="go_to", goal=(0.5,))
     with pytest.raises(DeclarationError, match=r"does not fit Box.*without an axis"):
         player.act(np.zeros((1, 2), np.float32))
     room = sw.Hierarchy(lambda: Point(as_dict=True), [Rest()], selector=lambda obs: [0] * len(obs))
@@ -125,13 +125,12 @@ def test_a_player_takes_a_goal():
     ):
         player.act(ZERO)
     with pytest.raises(DeclarationError, match="policy that takes none: name a skill"):
-        run.player(goal=(0, 0))
+        walks.player(goal=(0, 0))
 
 
 @pytest.mark.parametrize("goal", [(5, 5), (1, 2, 3), "x", (0.1, (0.2, 0.3)), {"at": 1}, np.nan])
-def test_a_refused_goal_leaves_the_player_as_it_was(goal):
-    run = declared([Walk()]).train(quiet=True)
-    player = run.player(skill="go_to", goal=(0.5, -0.5))
+def test_a_refused_goal_leaves_the_player_as_it_was(goal, walks):
+    player = walks.player(skill="go_to", goal=(0.5, -0.5))
     player.act(ZERO)
     with pytest.raises(SkillError, match="the player gave"):
         player.reset(goal=goal)
@@ -157,10 +156,9 @@ def test_a_player_never_acts_without_its_goal():
     assert np.allclose(player.act(np.float32([0.5, 0])), (0.5, 1))
 
 
-def test_a_player_keeps_its_own_goal():
-    run = declared([Walk()]).train(quiet=True)
+def test_a_player_keeps_its_own_goal(walks):
     goal = np.array([0.5, 0.5], np.float32)
-    player = run.player(skill="go_to", goal=goal)
+    player = walks.player(skill="go_to", goal=goal)
     goal[:] = 0.1
     assert np.allclose(player.act(ZERO), 0.5)
     goal[:] = -0.5

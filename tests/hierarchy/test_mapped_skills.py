@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,12 +22,12 @@ SELECTOR = PPO(num_envs=3, n_steps=8, batch_size=24, network=Network((8,)))
 class Recurrent(nn.Module):
     """A network with a state."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         torch.manual_seed(0)
         self.cell, self.head = nn.GRUCell(4, 6), nn.Linear(6, 1)
 
-    def forward(self, x: torch.Tensor, state: torch.Tensor) -> Any:
+    def forward(self, x: torch.Tensor, state: torch.Tensor):
         after = self.cell(x, state)
         return 3.0 * self.head(after), after
 
@@ -62,16 +61,14 @@ def declare() -> Hierarchy:
     )
 
 
-def test_a_run_that_is_stopped_in_the_middle_of_calls_goes_on_bit_for_bit(tmp_path: Path) -> None:
+def test_a_run_that_is_stopped_in_the_middle_of_calls_goes_on_bit_for_bit(tmp_path):
     whole = goes_on(declare, tmp_path)
     recorded = json.loads((whole.path / "run.json").read_text())["skills"][0]["policy"]
     assert recorded["mapping"]["every"] == 2
     assert recorded["mapping"]["sees"][""][1] == {"source": "last_action", "scale": 0.5}
 
 
-def test_a_loaded_run_acts_by_its_recorded_mapping(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loaded_run_acts_by_its_recorded_mapping(tmp_path, monkeypatch):
     run = declare().train(tmp_path / "run", seed=3, quiet=True)
     weights = run.save_weights(tmp_path / "weights.safetensors")
     other = sw.from_torch(Recurrent(), sees=(slice(0, 3), 0), state=(None, 6))
@@ -82,7 +79,7 @@ def test_a_loaded_run_acts_by_its_recorded_mapping(
     assert sw.evaluate(other, "Pendulum-v1", episodes=2).returns != wanted
 
 
-def test_a_hierarchy_of_mapped_skills_is_exported_and_loaded(tmp_path: Path) -> None:
+def test_a_hierarchy_of_mapped_skills_is_exported_and_loaded(tmp_path):
     pytest.importorskip("onnxscript")
     from skillweave.export.runner import Runner
 

@@ -122,7 +122,7 @@ def test_a_wrong_shape_names_the_skill_and_the_method(options, method):
     wrong = type("Wrong", (Left,), {method: lambda self, x: True})
     env = options(skill_set(wrong))
 
-    def play() -> None:
+    def play():
         env.reset(seed=0)
         env.step(np.zeros(N, int))
 

@@ -41,7 +41,7 @@ N = 6
 class Chooser(ScriptedPolicy):
     """A selector: its choice among the allowed skills follows from the observation."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int):
         super().__init__(None, Walk.observation_space, gym.spaces.Discrete(count))
 
     def act(self, memory, obs, mask=None, *, deterministic=True, rng=None):
@@ -195,12 +195,6 @@ def test_neither_act_nor_observe_changes_the_memory_given():
 
 def walk_obs(*positions: int) -> Array:
     return np.array([[0, 0, 0, x] for x in positions], np.float32)
-
-
-def test_where_no_skill_may_start_the_error_names_them():
-    policy = hierarchy(Right)
-    with pytest.raises(SkillweaveError, match=r"no skill may start.*'right'"):
-        policy.act(policy.start(2), walk_obs(0, 2))
 
 
 def test_where_no_skill_may_start_a_large_observation_is_told_in_part():

@@ -13,7 +13,7 @@ from small_runs import (
     Left as SmallLeft,
     Push,
     assert_same,
-    interrupt_at_checkpoint,
+    interrupted,
 )
 
 from skillweave import Agent, EnvSpec, Hierarchy, Reflex, SkillweaveError
@@ -110,13 +110,9 @@ EVOLVE = Evolution(population=2, generations=2, episodes=2)
         ({"evolve": {"left": EVOLVE}}, {}, ""),
     ],
 )
-def test_settings_that_differ_are_told_where_a_run_goes_on(
-    tmp_path, monkeypatch, capsys, first, then, says
-):
-    with monkeypatch.context() as patched:
-        interrupt_at_checkpoint(patched, 1)
-        with pytest.raises(KeyboardInterrupt):
-            declare().train(tmp_path / "run", seed=3, **first)
+def test_settings_that_differ_are_told_where_a_run_goes_on(tmp_path, capsys, first, then, says):
+    with interrupted(1):
+        declare().train(tmp_path / "run", seed=3, **first)
     capsys.readouterr()
     run = declare(**then).resume(tmp_path / "run")
     told = "".join(capsys.readouterr())
@@ -127,15 +123,13 @@ def test_settings_that_differ_are_told_where_a_run_goes_on(
     assert RunDirectory.open(tmp_path / "run").finished
 
 
-def test_a_cost_of_calls_below_that_differs_is_told(tmp_path, monkeypatch, capsys):
+def test_a_cost_of_calls_below_that_differs_is_told(tmp_path, capsys):
     def whole(cost):
         inner = declare(skills=[Left(), Push()], call_cost=cost, name="inner")
         return declare(skills=[Balance(), inner])
 
-    with monkeypatch.context() as patched:
-        interrupt_at_checkpoint(patched, 1)
-        with pytest.raises(KeyboardInterrupt):
-            whole(0.0).train(tmp_path / "run", quiet=True)
+    with interrupted(1):
+        whole(0.0).train(tmp_path / "run", quiet=True)
     capsys.readouterr()
     whole(0.5).resume(tmp_path / "run")
     told = "".join(capsys.readouterr())
@@ -148,10 +142,8 @@ def test_what_is_told_to_count_is_what_counts(tmp_path, monkeypatch, capsys):
 
     whole = declare(skills=[Left(), Balance()], call_cost=0.5)
     whole.train(tmp_path / "whole", seed=3, quiet=True)
-    with monkeypatch.context() as patched:
-        interrupt_at_checkpoint(patched, 1)
-        with pytest.raises(KeyboardInterrupt):
-            whole.train(tmp_path / "run", seed=3, quiet=True)
+    with interrupted(1):
+        whole.train(tmp_path / "run", seed=3, quiet=True)
     monkeypatch.setattr(Left, "max_steps", 4)
     monkeypatch.setattr(Left, "call_steps", 3)
     capsys.readouterr()
@@ -172,25 +164,21 @@ def test_a_loaded_hierarchy_shares_no_skills(tmp_path):
     assert mine.skills[0].steps == 200
 
 
-def test_a_recipe_is_not_asked_for_what_the_command_line_changed(tmp_path, monkeypatch, capsys):
+def test_a_recipe_is_not_asked_for_what_the_command_line_changed(tmp_path, capsys):
     one, other = declare(skill_steps=300), declare()
     one.recipe = other.recipe = "mine.py"
-    with monkeypatch.context() as patched:
-        interrupt_at_checkpoint(patched, 1)
-        with pytest.raises(KeyboardInterrupt):
-            one.train(tmp_path / "run")
+    with interrupted(1):
+        one.train(tmp_path / "run")
     capsys.readouterr()
     other.resume(tmp_path / "run")
     assert "own settings" not in "".join(capsys.readouterr())
 
 
 @pytest.mark.slow
-def test_a_run_without_its_code_tells_of_no_settings(tmp_path, monkeypatch, capsys):
+def test_a_run_without_its_code_tells_of_no_settings(tmp_path, capsys):
     agent = Agent("CartPole-v1", ON, 300, target_return=1e6)
-    with monkeypatch.context() as patched:
-        interrupt_at_checkpoint(patched, 1)
-        with pytest.raises(KeyboardInterrupt):
-            agent.train(tmp_path / "run", checkpoint_every=100, eval_every=100)
+    with interrupted(1):
+        agent.train(tmp_path / "run", checkpoint_every=100, eval_every=100)
     capsys.readouterr()
     path = tmp_path / "run"
     Agent.from_manifest(json.loads((path / "run.json").read_text())).resume(path)
@@ -199,10 +187,8 @@ def test_a_run_without_its_code_tells_of_no_settings(tmp_path, monkeypatch, caps
 
 def test_ctrl_c_says_how_far_it_is_saved_and_how_to_go_on(tmp_path, monkeypatch):
     path = tmp_path / "run"
-    with monkeypatch.context() as patched:
-        interrupt_at_checkpoint(patched, 1)
-        with pytest.raises(KeyboardInterrupt) as stop:
-            declare().train(path, seed=3)
+    with interrupted(1) as stop:
+        declare().train(path, seed=3)
     line = f'hierarchy.train("{path}", seed=3, resume=True)'
     assert str(stop.value) == f"saved at 128 steps of left. Continue: {line}"
 
@@ -230,23 +216,19 @@ COLORS = [
 ]
 
 
+def painted(color):
+    return type("Painted", (Left,), {"color": color})()
+
+
 @pytest.mark.parametrize("color", COLORS, ids=str)
 def test_a_color_that_is_none_is_refused(color):
-    class Painted(Left):
-        pass
-
-    Painted.color = color
     with pytest.raises(SkillweaveError, match=r"skill 'painted' .*color is .*red, green and blue"):
-        declare(skills=[Painted()])
+        declare(skills=[painted(color)])
 
 
 @pytest.mark.parametrize("color", [(1, 2, 3), [255, 0, 0], np.array([1, 2, 3], np.uint8)], ids=str)
 def test_a_color_may_be_of_any_kind_of_row(color):
-    class Painted(Left):
-        pass
-
-    Painted.color = color
-    assert declare(skills=[Painted()]).skills[0].color is color
+    assert declare(skills=[painted(color)]).skills[0].color is color
 
 
 def test_names_that_are_nearly_those_of_a_skill_are_told():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -22,19 +21,19 @@ NAMES = "left", "right", "stay"
 
 def declare(names: tuple[str, ...] = NAMES) -> Hierarchy:
     skills = [type(name, (Skill,), {"name": name})() for name in names]
-    how: dict[str, Any] = {"skill_steps": 32, "selector_steps": 64, "call_steps": 4}
+    how = {"skill_steps": 32, "selector_steps": 64, "call_steps": 4}
     return Hierarchy("CartPole-v1", skills, algorithm=SMALL, selector=SMALL, **plainly(how))
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("places")
     declare().train(folder / "run", quiet=True).save_weights(folder / "w.safetensors")
     return folder
 
 
 @pytest.fixture
-def run(trained: Path, tmp_path: Path) -> Path:
+def run(trained, tmp_path) -> Path:
     shutil.copytree(trained / "run", tmp_path / "run")
     return tmp_path / "run"
 
@@ -43,7 +42,15 @@ def policy(run: Path, stage: str) -> Path:
     return run / "policies" / f"{stage}.safetensors"
 
 
-def test_swapped_skills_are_refused(run: Path) -> None:
+def rewrite(run: Path, stage: str, tensors, header):
+    """Write a stage's policy, with a checksum that fits."""
+    data = read_json(run / "run.json")
+    entry = next(entry for entry in data["stages"] if entry["name"] == stage)
+    entry["sha256"] = write_tensors(policy(run, stage), tensors, header)
+    write_json(run / "run.json", data)
+
+
+def test_swapped_skills_are_refused(run):
     a, b = policy(run, "left"), policy(run, "right")
     first, second = a.read_bytes(), b.read_bytes()
     a.write_bytes(second)
@@ -52,15 +59,12 @@ def test_swapped_skills_are_refused(run: Path) -> None:
         declare().load(run)
 
 
-def test_a_selector_in_the_place_of_a_skill_is_refused(run: Path) -> None:
+def test_a_selector_in_the_place_of_a_skill_is_refused(run):
     """Even where header and checksum were made to fit."""
     for target, source in (("left", "selector"), ("selector", "right")):
         before, manifest = policy(run, target).read_bytes(), (run / "run.json").read_bytes()
         tensors, header = read_tensors(policy(run, source))
-        data = read_json(run / "run.json")
-        entry = next(entry for entry in data["stages"] if entry["name"] == target)
-        entry["sha256"] = write_tensors(policy(run, target), tensors, header | {"stage": target})
-        write_json(run / "run.json", data)
+        rewrite(run, target, tensors, header | {"stage": target})
         with pytest.raises(SkillweaveError, match=r"in the place of .* has action_space Discrete"):
             declare().load(run)
         policy(run, target).write_bytes(before)
@@ -68,21 +72,17 @@ def test_a_selector_in_the_place_of_a_skill_is_refused(run: Path) -> None:
     declare().load(run).evaluate(1)
 
 
-def test_a_selector_alone_is_no_flat_agent(run: Path) -> None:
+def test_a_selector_alone_is_no_flat_agent(run):
     with pytest.raises(SkillweaveError, match="holds the policy of stage 'selector' alone"):
         declare(("left", "right")).load_weights(policy(run, "selector"))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("name", ["actor.0.weight", "critic.1.bias"])
-def test_weights_that_are_not_finite_are_refused_by_name(
-    run: Path, trained: Path, tmp_path: Path, name: str, value: float
-) -> None:
+def test_weights_that_are_not_finite_are_refused_by_name(run, trained, tmp_path, name, value):
     tensors, header = read_tensors(policy(run, "selector"))
     tensors[name].view(-1)[0] = value
-    data = read_json(run / "run.json")
-    data["stages"][-1]["sha256"] = write_tensors(policy(run, "selector"), tensors, header)
-    write_json(run / "run.json", data)
+    rewrite(run, "selector", tensors, header)
     with pytest.raises(SkillweaveError, match=f"tensor {name} holds NaN or infinity"):
         declare().load(run)
     tensors, header = read_tensors(trained / "w.safetensors")
@@ -92,12 +92,10 @@ def test_weights_that_are_not_finite_are_refused_by_name(
         declare().load_weights(tmp_path / "w.safetensors")
 
 
-def test_weights_of_another_type_are_refused_by_name(run: Path) -> None:
+def test_weights_of_another_type_are_refused_by_name(run):
     tensors, header = read_tensors(policy(run, "left"))
     tensors["actor.0.weight"] = tensors["actor.0.weight"].double()
-    data = read_json(run / "run.json")
-    data["stages"][0]["sha256"] = write_tensors(policy(run, "left"), tensors, header)
-    write_json(run / "run.json", data)
+    rewrite(run, "left", tensors, header)
     says = r"tensor actor\.0\.weight should hold torch\.float32, found torch\.float64"
     with pytest.raises(SkillweaveError, match=says):
         declare().load(run)
@@ -112,9 +110,7 @@ def test_weights_of_another_type_are_refused_by_name(run: Path) -> None:
         ({"env": ["CartPole-v1"]}, "env is ['CartPole-v1']; it must be a text"),
     ],
 )
-def test_a_wrong_field_of_a_weights_file_is_named(
-    trained: Path, tmp_path: Path, change: dict[str, Any], says: str
-) -> None:
+def test_a_wrong_field_of_a_weights_file_is_named(trained, tmp_path, change, says):
     path = tmp_path / "w.safetensors"
     tensors, header = read_tensors(trained / "w.safetensors")
     write_tensors(path, tensors, header | change)
@@ -128,9 +124,7 @@ def test_a_wrong_field_of_a_weights_file_is_named(
 
 @pytest.mark.parametrize("part", ["observation_space", "action_space", "algorithm"])
 @pytest.mark.parametrize("value", [{}, {"type": []}, {"type": "Box", "shape": [10**12]}, None])
-def test_a_damaged_part_of_a_policys_header_is_named(
-    trained: Path, tmp_path: Path, part: str, value: Any
-) -> None:
+def test_a_damaged_part_of_a_policys_header_is_named(trained, tmp_path, part, value):
     path = tmp_path / "w.safetensors"
     tensors, header = read_tensors(trained / "w.safetensors")
     header["parts"]["left"][part] = value
@@ -140,9 +134,7 @@ def test_a_damaged_part_of_a_policys_header_is_named(
     assert str(caught.value).startswith((f"{path} (left)", f"{path}: parts['left'].{part}"))
 
 
-def test_a_flat_agents_damaged_header_is_told_by_the_command_line(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_flat_agents_damaged_header_is_told_by_the_command_line(run, tmp_path, capsys):
     tensors, header = read_tensors(policy(run, "left"))
     path = tmp_path / "w.safetensors"
     for change in ({"env": 5, "env_kwargs": {}}, {"env": "CartPole-v1", "env_kwargs": 5}):
@@ -151,7 +143,7 @@ def test_a_flat_agents_damaged_header_is_told_by_the_command_line(
         assert "is 5; it must be" in capsys.readouterr().err
 
 
-def test_an_agents_state_of_another_shape_or_type_is_refused(tmp_path: Path) -> None:
+def test_an_agents_state_of_another_shape_or_type_is_refused(tmp_path):
     path = tmp_path / "agent.safetensors"
     agilerl.DQN((3,), 2, False).saveCheckpoint(path)
     tensors, header = read_tensors(path)
@@ -162,7 +154,7 @@ def test_an_agents_state_of_another_shape_or_type_is_refused(tmp_path: Path) -> 
             agilerl.DQN.load(path)
 
 
-def test_a_state_that_lacks_a_tensor_is_refused_by_name() -> None:
+def test_a_state_that_lacks_a_tensor_is_refused_by_name():
     state = agilerl.DQN((3,), 2, False).member.state
     tensors = dict(vars(state))
     assert torch.equal(state_from(tensors, state, "x").params, state.params)

@@ -13,7 +13,7 @@ import skillweave as sw
 SMALL = sw.Network(hidden=(8,))
 ON = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
 
-SPACES: dict[str, Any] = {
+SPACES = {
     "dict": Dict(arm=Box(-2, 2, (2,), np.float32), grip=Discrete(2, start=3)),
     "tuple": Tuple((Box(-2, 2, (2,), np.float32), Discrete(2, start=3))),
     "nested": Dict(
@@ -36,21 +36,21 @@ class Reach(gym.Env[Any, Any]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
     observation_space = Box(-1, 1, (3,), np.float32)
 
-    def __init__(self, kind: str = "dict", render_mode: str | None = None, info: Any = None):
+    def __init__(self, kind: str = "dict", render_mode: str | None = None, info=None):
         self.action_space, self.kind, self.render_mode = SPACES[kind], kind, render_mode
         self.info = info or {}
-        self.actions: list[Any] = []
+        self.actions = []
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+    def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.steps = 0
         return self._draw(), self.info
 
-    def _draw(self) -> Any:
+    def _draw(self):
         self.obs = self.np_random.uniform(-1, 1, 3).astype(np.float32)
         return self.obs.copy()
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         assert self.action_space.contains(action), action
         self.actions.append(action)
         if self.kind == "whole":
@@ -63,7 +63,7 @@ class Reach(gym.Env[Any, Any]):
         self.steps += 1
         return self._draw(), float(reward), False, self.steps >= 10, self.info
 
-    def render(self) -> Any:
+    def render(self):
         return np.full((32, 32, 3), 20 * self.steps, np.uint8)
 
 
@@ -72,7 +72,7 @@ class Arm(sw.Skill):
 
     acts = "arm"
 
-    def reward(self, step: sw.Step) -> Any:
+    def reward(self, step: sw.Step):
         return -np.abs(step.action["arm"] - step.obs[:, :2]).sum(axis=1)
 
 
@@ -81,7 +81,7 @@ class Grip(sw.Skill):
 
     acts = ("grip",)
 
-    def reward(self, step: sw.Step) -> Any:
+    def reward(self, step: sw.Step):
         return ((step.action["grip"] == 4) == (step.obs[:, 2] > 0)).astype(np.float32)
 
 
@@ -89,7 +89,7 @@ class Whole(sw.Skill):
     """Moves both."""
 
 
-def by_hand(obs: Any) -> Any:
+def by_hand(obs):
     """The best action."""
     return {"arm": obs[:, :2], "grip": 3 + (obs[:, 2] > 0)}
 
@@ -97,17 +97,17 @@ def by_hand(obs: Any) -> Any:
 class Ready(sw.Skill):
     """Does the best action."""
 
-    def policy(self, obs: Any) -> Any:
+    def policy(self, obs):
         return by_hand(obs)
 
 
-def on(kind: str = "dict", **kwargs: Any) -> sw.EnvSpec:
+def on(kind: str = "dict", **kwargs) -> sw.EnvSpec:
     return sw.EnvSpec(Reach, {"kind": kind, **kwargs}, engine="sync", workers=1)
 
 
-def reach(skills: Any = None, **how: Any) -> sw.Hierarchy:
+def reach(skills=None, **how) -> sw.Hierarchy:
     """Return a hierarchy with small budgets."""
-    settings: dict[str, Any] = {
+    settings = {
         "env": on(),
         "call_steps": 3,
         "steps": 400,

@@ -25,7 +25,7 @@ OFTEN = sw.TrainDefaults(checkpoint_every=60)
 LEARNS = sw.PPO(num_envs=8, n_steps=64, learning_rate=3e-3, ent_coef=0.0, network=sw.Network((32,)))
 
 
-def played(policy: Any, kind: str = "dict", steps: int = 10) -> list[Any]:
+def played(policy, kind: str = "dict", steps: int = 10) -> list[Any]:
     """Return the actions of an episode, each of which the environment has checked."""
     env, player = Reach(kind), sw.Player(policy)
     obs, _ = env.reset(seed=0)
@@ -53,13 +53,6 @@ def test_a_plain_agent_acts_as_it_is_evaluated(kind, squash, tmp_path):
     assert len(played(run.policy, kind)) == 10
 
 
-@pytest.mark.parametrize("algorithm", [sw.SAC(), sw.DQN(), sw.TD3()], ids=["SAC", "DQN", "TD3"])
-def test_other_algorithms_say_which_one_can(algorithm, tmp_path):
-    words = r"cannot act in Dict.*; PPO, SelfImitationPPO can"
-    with pytest.raises(DeclarationError, match=words):
-        sw.train_agent(on("dict"), algorithm, 100, tmp_path / "run", quiet=True)
-
-
 def test_an_export_acts_as_here(tmp_path):
     pytest.importorskip("onnxscript")
     run = sw.train_agent(on("dict"), ON, 64, tmp_path / "run", quiet=True)
@@ -81,7 +74,7 @@ def test_an_export_acts_as_here(tmp_path):
 
 
 def declared(name: str) -> sw.Hierarchy:
-    how: dict[str, Any] = {
+    how = {
         "together": {"learn": "together"},
         "apart": {"learn": "apart"},
         "held": {"rest": {"arm": ("hold", 0.5), "grip": "hold"}},
@@ -89,7 +82,7 @@ def declared(name: str) -> sw.Hierarchy:
         "self-imitation": {"algorithm": sw.SelfImitationPPO(num_envs=4, n_steps=16, network=SMALL)},
         "nested": {},
     }[name]
-    skills: Any = None
+    skills = None
     if name == "nested":
         inner = reach([Arm(), Ready()], name="inner", call_steps=2)
         skills = [inner, Grip(), Whole()]
@@ -112,7 +105,7 @@ def test_each_skill_writes_its_part():
     assert roles["grip"].action_space == SPACES["dict"]["grip"]
     assert roles["whole"].action_space == SPACES["dict"]
 
-    def in_turn(obs: Any) -> Any:
+    def in_turn(obs):
         return np.where(obs[:, 0] > 0, "arm", "grip")
 
     run = reach([Arm(), Grip()], selector=in_turn, call_steps=1).train(quiet=True)
@@ -137,7 +130,7 @@ def test_scripts_and_reflexes_return_dicts():
     assert sw.evaluate(held, on(), episodes=2).mean < 9
     shut = sw.Reflex(lambda obs: obs[:, 0] > 0, {"arm": [0.5, 0.5], "grip": 4})
 
-    def opened(obs: Any) -> Any:
+    def opened(obs):
         return {**by_hand(obs), "grip": np.full(len(obs), 3)}
 
     computed = sw.Reflex(lambda obs: obs[:, 0] < -0.5, opened)
@@ -156,7 +149,7 @@ def test_scripts_and_reflexes_return_dicts():
 
 @pytest.mark.parametrize("kind", ["dict", "tuple"])
 def test_a_script_holds_actions_of_several_parts(kind, tmp_path):
-    def act(obs: Any) -> Any:
+    def act(obs):
         return by_hand(obs) if kind == "dict" else tuple(by_hand(obs).values())
 
     class Slow(sw.Skill):
@@ -195,11 +188,11 @@ def test_a_tuple_is_written_by_its_places():
     class Second(sw.Skill):
         acts = "1"
 
-        def reward(self, step: sw.Step) -> Any:
+        def reward(self, step: sw.Step):
             return (step.action["1"] == 4).astype(np.float32)
 
     class Both(sw.Skill):
-        def policy(self, obs: Any) -> Any:
+        def policy(self, obs):
             return obs[:, :2], np.full(len(obs), 3)
 
     run = reach([Second(), Both()], env=on("tuple")).train(quiet=True)

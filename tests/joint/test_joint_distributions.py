@@ -1,7 +1,5 @@
 """The distribution of actions with several parts, in numbers by hand."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -28,13 +27,13 @@ SIZES = {"dict": 2, "tuple": 2, "nested": 2 + 6 + 5 + 4, "whole": 3 + 6}
 class Masked(Reach):
     """Forbids one value of each choice, another one in each step, and refuses it."""
 
-    def __init__(self, kind: str = "dict", form: str = "parts", **how: Any) -> None:
+    def __init__(self, kind: str = "dict", form: str = "parts", **how):
         super().__init__(kind, **how)
         self.form = form
         if form == "method":
             self.action_masks = self.allowed
 
-    def allowed(self) -> Any:
+    def allowed(self):
         """Return a mask for each part, as lists; the bits of a MultiBinary have two numbers."""
         at = self.steps % 2
         two = [1 - at, at]
@@ -45,7 +44,7 @@ class Masked(Reach):
             return {"grip": two, "more": (bits, {"a": numbers, "b": [at, 1, 1, 0]})}
         return {"grip": two} if self.kind == "dict" else (None, two)
 
-    def _draw(self) -> Any:
+    def _draw(self):
         found = super()._draw()
         if self.form == "flat":
             self.info = {"action_mask": space_of(self.action_space).allowed(self.allowed())}
@@ -53,13 +52,13 @@ class Masked(Reach):
             self.info = {"action_mask": self.allowed()}
         return found
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         mask = space_of(self.action_space).allowed(self.allowed())
         assert mask[_numbers(action, self.action_space)].all(), (action, self.steps)
         return super().step(action)
 
 
-def _numbers(action: Any, space: Any) -> Any:
+def _numbers(action, space):
     """Return the places in a mask of the choices that an action makes."""
     codec = action_codec(space)
     packed = np.zeros((1, *obs_shape(space)), obs_dtype(space))
@@ -96,6 +95,7 @@ def test_random_actions_are_allowed(kind):
         assert mask[0][_numbers(space_of(space).unpacked(action), space)].all()
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", ["PPO", "SelfImitationPPO", "recurrent"])
 def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
     algorithm = {
@@ -166,7 +166,7 @@ def test_log_probabilities_are_those_of_the_allowed_choices():
     assert torch.allclose(divergence, head.kl(masked_params, log_std, masked_other, log_std, None))
 
 
-WRONG: dict[str, Any] = {
+WRONG = {
     "another part": ({"grap": [1, 0]}, r"has the parts \['grap'\], but .* have 'arm', 'grip'"),
     "too short": ({"grip": [1]}, r"action_mask\['grip'\] is \[1\]; .* Discrete\(2, start=3\), 2"),
     "nothing": ({"grip": [0, 0]}, "allows no action"),

@@ -16,14 +16,14 @@ WHY = {"own": CallEnd.OWN, "limit": CallEnd.LIMIT, "end": CallEnd.EPISODE, "cut"
 
 def log_of(
     skills: Sequence[str], episodes: Sequence[Any], size: int = 1, lengths: Sequence[int] = (),
-    rewards: Any = None,
+    rewards = None
 ) -> CallLog:  # fmt: skip
     """A log of episodes (first observation, [(choice, [observations inside], won, why), …]).
 
     ``why`` is own, limit, end (the episode terminated) or cut (its time limit). An observation is a
     number, or several.
     """
-    rows, inside, choices = list[Any](), list[Any](), len(skills) * max(1, len(lengths))
+    rows, inside, choices = [], [], len(skills) * max(1, len(lengths))
     for e, (here, calls) in enumerate(episodes):
         age = 0
         for order, (choice, steps, won, why) in enumerate(calls):

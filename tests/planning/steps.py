@@ -13,7 +13,7 @@ from skillweave.skills import LastCall
 from skillweave.types import Array, Step
 
 
-def step_to(after: Any, before: Any = None, **more: Any) -> Step:
+def step_to(after, before=None, **more) -> Step:
     """A step of n environments to the observations ``after`` (n, D)."""
     after = np.asarray(after, np.float32)
     before = np.zeros_like(after) if before is None else np.asarray(before, np.float32)
@@ -31,7 +31,7 @@ def step_to(after: Any, before: Any = None, **more: Any) -> Step:
     return Step(obs=before, next_obs=after, **values)
 
 
-def column(i: int) -> Any:
+def column(i: int):
     """A predicate: number ``i`` of the observation is not 0."""
 
     def holds(obs: Array) -> Array:
@@ -46,7 +46,7 @@ def at(*places: float) -> Predicate:
     return Predicate(lambda obs: np.isin(obs[:, 0], places), f"at {places[0]}", "obs")
 
 
-def assert_not_repeated(planner: Planner, ahead: Callable[[Any], Any]) -> None:
+def assert_not_repeated(planner: Planner, ahead: Callable[[Any], Any]):
     """At 2 is a wall: choices that are ``ahead`` lead nowhere, but are made a few times at most."""
     memory, obs, chosen = planner.start(1), np.float32([[2]]), [True]
     while chosen[-1] and len(chosen) < 7:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from logs import log_of
@@ -17,7 +15,7 @@ A, B = 0, 1
 def log(works: str, calls: int = 120) -> CallLog:
     """Skill a ends between 0 and 1; b, called after it, works ``never`` or where it ended "low"."""
     rng = np.random.default_rng(0)
-    episodes: list[tuple[float, list[tuple[int, list[float], bool, str]]]] = []
+    episodes = []
     for _ in range(calls):
         end = float(rng.random())
         won = {"never": False, "always": True, "low": end < 0.4}[works]
@@ -27,7 +25,7 @@ def log(works: str, calls: int = 120) -> CallLog:
     return log_of(["a", "b"], episodes)
 
 
-def test_the_first_is_to_blame_where_other_ends_of_it_would_do() -> None:
+def test_the_first_is_to_blame_where_other_ends_of_it_would_do():
     found = log("low").blame("b", "a")
     assert found.first
     assert found.best > 0.9
@@ -39,7 +37,7 @@ def test_the_first_is_to_blame_where_other_ends_of_it_would_do() -> None:
     assert "100% reached their limit of steps" in str(found)
 
 
-def test_the_second_must_learn_where_no_end_would_do() -> None:
+def test_the_second_must_learn_where_no_end_would_do():
     found = log("never").blame("b", "a")
     assert not found.first
     assert (found.rate, found.calls) == (0.0, 120)
@@ -51,14 +49,12 @@ def test_the_second_must_learn_where_no_end_would_do() -> None:
     ("decides", "elsewhere", "first"),
     [("end", False, True), ("key", False, False), ("place", True, True)],
 )
-def test_only_what_the_first_skill_changes_is_held_against_it(
-    decides: str, elsewhere: bool, first: bool
-) -> None:
+def test_only_what_the_first_skill_changes_is_held_against_it(decides, elsewhere, first):
     """Number 1 is fixed in an episode; a ends anywhere ("end"), or at the place of that number.
 
     Where b also starts elsewhere, its calls show that the place decides, not the number.
     """
-    rng, episodes = np.random.default_rng(0), list[Any]()
+    rng, episodes = np.random.default_rng(0), []
     for key in rng.random(120):
         end = rng.random() if decides == "end" else key
         won = bool(end < 0.4)
@@ -71,31 +67,31 @@ def test_only_what_the_first_skill_changes_is_held_against_it(
     assert f"in {found.rate:.0%} of 120 calls (" in str(found)
 
 
-def test_none_is_to_blame_where_it_works() -> None:
+def test_none_is_to_blame_where_it_works():
     found = log("always").blame("b", "a")
     assert found.fine
     assert "neither skill is to blame" in str(found)
     assert log("never").blame("b", "start").fine
 
 
-def test_an_event_judges_in_place_of_success() -> None:
+def test_an_event_judges_in_place_of_success():
     found = log("never").blame("b", "a", done={"b": lambda obs: obs[:, 0] < 0.4})
     assert found.first
 
 
-def test_few_calls_do_not_tell() -> None:
+def test_few_calls_do_not_tell():
     found = log("never", 8).blame("b", "a")
     assert np.isnan(found.best)
     assert "too few calls to say which skill is to blame" in str(found)
 
 
-def test_a_pair_without_a_call_is_said() -> None:
+def test_a_pair_without_a_call_is_said():
     with pytest.raises(RunError, match="no call of 'a' after a call of 'b'"):
         log("low").blame("a", "b")
 
 
 @pytest.mark.parametrize("calls", [44, 45, 124])
-def test_a_skill_that_is_always_done_is_to_blame_for_nothing(calls: int) -> None:
+def test_a_skill_that_is_always_done_is_to_blame_for_nothing(calls):
     nan, reasons = float("nan"), {"own": 0, "limit": 0, "interrupted": 0, "episode": 0}
     found = Blame("b", "a", 1.0, 1.0, calls, 9, 1.0, 1.0, None, (nan, nan), reasons, False)
     assert "neither skill is to blame" in str(found)

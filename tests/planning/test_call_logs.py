@@ -38,7 +38,7 @@ POINT = EnvSpec(lambda: Point(as_dict=True), engine="sync")  # observations are 
 SKILLS = (GetKey(), OpenDoor(), Leave(), Wait())
 
 
-def skill_set(**how: Any) -> SkillSet:
+def skill_set(**how) -> SkillSet:
     return skills_of(*SKILLS, **how)
 
 
@@ -47,12 +47,12 @@ def log() -> CallLog:
     return record_calls(SPEC, skill_set(call_steps=5), 600, num_envs=4, seed=3, info=["door"])
 
 
-def by_hand(obs: Any, skill: int, age: int, most: int) -> list[Any]:
+def by_hand(obs, skill: int, age: int, most: int) -> list[Any]:
     """The steps of one call in the corridor: observations; and why it ended."""
     place, key, door = (int(x) for x in obs)
     move = (-1, 1, 1, 0)[skill]
     limit = min(most, (most, 12, 1, 2)[skill])
-    found: list[Any] = []
+    found = []
     for t in range(1, limit + 1):
         place = max(0, min(place + move, LAST + door))
         key |= place == 0
@@ -67,10 +67,10 @@ def by_hand(obs: Any, skill: int, age: int, most: int) -> list[Any]:
     return [found, CallEnd.LIMIT, False, False]
 
 
-def test_every_call_is_that_of_a_loop_by_hand(log: CallLog) -> None:
-    ages: dict[int, int] = {}
-    ends: dict[int, Any] = {}
-    orders: dict[int, int] = {}
+def test_every_call_is_that_of_a_loop_by_hand(log):
+    ages = {}
+    ends = {}
+    orders = {}
     for c in range(len(log)):
         episode, skill = int(log.episode[c]), int(log.skill[c])
         assert log.order[c] == orders.setdefault(episode, 0)
@@ -99,7 +99,7 @@ def test_every_call_is_that_of_a_loop_by_hand(log: CallLog) -> None:
     assert np.unique(log.episode).tolist() == list(range(log.episode.max() + 1))
 
 
-def test_what_follows_from_the_columns(log: CallLog) -> None:
+def test_what_follows_from_the_columns(log):
     assert log.tau.sum() == log.steps == log.offset[-1]
     following = log.followed_by
     for c in range(len(log)):
@@ -130,7 +130,7 @@ def test_what_follows_from_the_columns(log: CallLog) -> None:
     assert repr(log.take(np.array([0]))).startswith("<CallLog: 1 calls (")
 
 
-def test_the_same_seed_gives_the_same_log(log: CallLog) -> None:
+def test_the_same_seed_gives_the_same_log(log):
     again = record_calls(SPEC, skill_set(call_steps=5), 600, num_envs=4, seed=3, info=["door"])
     other = record_calls(SPEC, skill_set(call_steps=5), 600, num_envs=4, seed=4, info=["door"])
     for name, column in columns_of(log).items():
@@ -138,7 +138,7 @@ def test_the_same_seed_gives_the_same_log(log: CallLog) -> None:
     assert not np.array_equal(log.choice[:50], other.choice[:50])
 
 
-def test_calls_of_a_selector_and_of_chosen_lengths() -> None:
+def test_calls_of_a_selector_and_of_chosen_lengths():
     chain = Automaton(
         {"search": "get_key", "unlock": "open_door", "free": "leave"},
         {
@@ -159,7 +159,7 @@ def test_calls_of_a_selector_and_of_chosen_lengths() -> None:
     assert set(made.choice) == set(range(8))
 
 
-def test_a_log_is_saved_and_read(log: CallLog, tmp_path: Any) -> None:
+def test_a_log_is_saved_and_read(log, tmp_path):
     class Move(Skill):
         max_steps = 3
         policy = ScriptedPolicy(
@@ -201,14 +201,14 @@ DAMAGE = {
 }
 
 
-def with_values(x: Any, *values: int) -> Any:
+def with_values(x, *values: int):
     x[1 : len(values) + 1] = values
     return x
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("name", DAMAGE)
-def test_a_damaged_file_is_refused(log: CallLog, tmp_path: Any, name: str) -> None:
+def test_a_damaged_file_is_refused(log, tmp_path, name):
     damage, message = DAMAGE[name]
     name = name.strip()
     path = tmp_path / "log.safetensors"
@@ -223,7 +223,7 @@ def test_a_damaged_file_is_refused(log: CallLog, tmp_path: Any, name: str) -> No
         CallLog.load(path)
 
 
-def test_other_files_are_refused(log: CallLog, tmp_path: Any) -> None:
+def test_other_files_are_refused(log, tmp_path):
     path = tmp_path / "log.safetensors"
     with pytest.raises(RunError, match="does not exist"):
         CallLog.load(path)
@@ -246,7 +246,7 @@ def test_other_files_are_refused(log: CallLog, tmp_path: Any) -> None:
         CallLog.load(path)
 
 
-def test_logs_are_joined(log: CallLog) -> None:
+def test_logs_are_joined(log):
     other = record_calls(SPEC, skill_set(call_steps=5), 100, num_envs=4, info=["door"])
     both = join([log, other])
     assert (len(both), both.steps) == (len(log) + len(other), log.steps + other.steps)
@@ -266,7 +266,7 @@ def test_logs_are_joined(log: CallLog) -> None:
         join([])
 
 
-def test_a_log_of_other_skills_says_so(log: CallLog) -> None:
+def test_a_log_of_other_skills_says_so(log):
     log.check_skills(skill_set(call_steps=5))
     for skills, message in (
         (skill_set(call_steps=6), "'get_key' has changed since the log was recorded"),
@@ -292,7 +292,7 @@ def test_a_log_of_other_skills_says_so(log: CallLog) -> None:
         ({"steps": 10**12}, DeclarationError, "at most 4 GiB are recorded"),
     ],
 )
-def test_wrong_arguments(how: Any, kind: Any, message: str) -> None:
+def test_wrong_arguments(how, kind, message):
     given = {"env": SPEC, "skills": skill_set(), "steps": 10} | how
     with pytest.raises(kind, match=message):
         record_calls(**given)

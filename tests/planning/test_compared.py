@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -30,35 +29,35 @@ def walks(to_goal: bool, episodes: int = 60) -> CallLog:
     return log_of(["go"], made, size=2)
 
 
-def test_a_goal_that_skills_ignore_does_not_divide_the_log() -> None:
+def test_a_goal_that_skills_ignore_does_not_divide_the_log():
     assert compared_places(walks(to_goal=False)) == ([0],)
 
 
-def test_a_goal_to_which_a_skill_goes_counts() -> None:
+def test_a_goal_to_which_a_skill_goes_counts():
     assert compared_places(walks(to_goal=True)) == (None,)
     assert compared_places(replace(walks(to_goal=True), sees=((0,),))) == ([0],)
     assert compared_places(replace(walks(to_goal=True), sees=((0, 1),))) == ([0, 1],)
 
 
-def test_few_calls_say_nothing() -> None:
+def test_few_calls_say_nothing():
     assert compared_places(walks(to_goal=False, episodes=10)) == (None,)
 
 
-def test_a_number_that_changes_within_an_episode_stays() -> None:
+def test_a_number_that_changes_within_an_episode_stays():
     log = walks(to_goal=False)
     log.next_obs[log.steps // 2 :, 1] += 1  # one episode's goal moves within a call
     assert compared_places(log) == (None,)
 
 
-def reads_goal(obs: Any) -> Any:
+def reads_goal(obs):
     return obs[:, 0] == obs[:, 1]
 
 
-def reads_place(obs: Any) -> Any:
+def reads_place(obs):
     return obs[:, 0] == 8
 
 
-def reads_goal_of_step(step: Any) -> Any:
+def reads_goal_of_step(step):
     return step.next_obs[:, 0] == step.obs[:, 1]
 
 
@@ -71,20 +70,20 @@ def reads_goal_of_step(step: Any) -> Any:
         (GoalTask(lambda obs, goal: obs[:, 0] == goal[..., 0], columns=(1,)), [0]),
     ],
 )
-def test_a_goal_that_the_task_reads_counts(task: Any, wanted: list[int]) -> None:
+def test_a_goal_that_the_task_reads_counts(task, wanted):
     planner = Planner(walks(to_goal=False), task)
     assert planner.compared == {"go": wanted}
 
 
 @pytest.mark.parametrize("of_info", [False, True])
-def test_a_goal_counts_where_the_environment_pays_for_it(of_info: bool) -> None:
+def test_a_goal_counts_where_the_environment_pays_for_it(of_info):
     """A task that reads the reward reads the goal without its number."""
     log = walks(to_goal=False)
     home = (log.next_obs[:, 0] == log.next_obs[:, 1]).astype(np.float32)
     column = home if of_info else np.zeros_like(home)
     log = replace(log, reward=home - column, info={"home": column, "luck": home[::-1].copy()})
 
-    def pays(step: Any) -> Any:
+    def pays(step):
         return step.info["home"] if of_info else step.reward
 
     assert Planner(log, pays).compared == {"go": [0, 1]}
@@ -92,14 +91,14 @@ def test_a_goal_counts_where_the_environment_pays_for_it(of_info: bool) -> None:
     assert Planner(log, lambda step: step.info["luck"]).compared == {"go": [0]}
 
 
-def test_parts_of_a_dict() -> None:
+def test_parts_of_a_dict():
     """Observations with "observation", "achieved_goal" and "desired_goal"."""
     plain = walks(to_goal=False)
     box = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
     names = ("observation", "achieved_goal", "desired_goal")
     space = gym.spaces.Dict(dict.fromkeys(names, box))
 
-    def packed(obs: Any) -> Any:
+    def packed(obs):
         found = np.zeros(len(obs), [(name, np.float32, (1,)) for name in space.spaces])
         found["observation"] = found["achieved_goal"] = obs[:, :1]
         found["desired_goal"] = obs[:, 1:]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from planning.logs import log_of
@@ -17,14 +15,14 @@ A, B = 0, 1
 
 def goes_right(share: float, episodes: int = 100) -> CallLog:
     """From 0, "a" walks to 1 in two steps, or ends the episode; from there "b" to 2."""
-    way: list[Any] = [(A, [0.5, 1], True, "own"), (B, [2], True, "own")]
-    lost: list[Any] = [(A, [-1], False, "end")]
+    way = [(A, [0.5, 1], True, "own"), (B, [2], True, "own")]
+    lost = [(A, [-1], False, "end")]
     won = round(share * episodes)
     return log_of(["a", "b"], [(0, way)] * won + [(0, lost)] * (episodes - won))
 
 
 @pytest.mark.parametrize("share", [0.1, 0.6, 1.0])
-def test_the_chance_is_that_of_the_logged_calls(share: float) -> None:
+def test_the_chance_is_that_of_the_logged_calls(share):
     expected = forecast(Planner(goes_right(share), Mission(at(1), at(2))))
     assert expected.chance == pytest.approx(share, abs=0.1)
     assert expected.interval[0] < expected.chance <= expected.interval[1] + 1e-9
@@ -34,16 +32,16 @@ def test_the_chance_is_that_of_the_logged_calls(share: float) -> None:
     assert str(expected).startswith("a (2 steps) → b (1 steps): a chance of ")
 
 
-def test_few_starts_make_a_wide_interval() -> None:
+def test_few_starts_make_a_wide_interval():
     low, high = forecast(Planner(goes_right(0.5, 10), Mission(at(1)))).interval
     assert high - low > 0.4
 
 
-def test_what_never_changes_in_an_episode_stays() -> None:
+def test_what_never_changes_in_an_episode_stays():
     """ "a" goes to the place that number 1 holds, "b" back to 0, in half of the episodes to 1."""
-    rng, episodes = np.random.default_rng(0), list[Any]()
+    rng, episodes = np.random.default_rng(0), []
     for i in range(120):
-        key, here, calls = i % 2, 0.0, list[Any]()
+        key, here, calls = i % 2, 0.0, []
         for _ in range(4):
             skill = int(rng.integers(2))
             here = [key, 0.0][skill] + rng.normal(0, 0.01)
@@ -62,7 +60,7 @@ def test_what_never_changes_in_an_episode_stays() -> None:
         (Mission(at(1), at(2), held(at(0.5), 2)), ["at 0.5", "at 2"]),
     ],
 )
-def test_an_order_that_never_comes_is_named(task: Any, words: list[str]) -> None:
+def test_an_order_that_never_comes_is_named(task, words):
     steps = [(0, [(A, [0, 1], True, "own"), (B, [0.5, 2], True, "own")])]
     planner = Planner(log_of(["a", "b"], steps * 5), task)
     assert all(word in planner.obstacle for word in words)
@@ -79,7 +77,7 @@ def test_an_order_that_never_comes_is_named(task: Any, words: list[str]) -> None
         GoalTask(lambda obs, goal: obs[:, 0] == goal[0], goal=[3]),
     ],
 )
-def test_what_the_log_allows_is_not_named(task: Any) -> None:
+def test_what_the_log_allows_is_not_named(task):
     episodes = [
         (0, [(A, [1], True, "own"), (A, [1], True, "own"), (B, [2], True, "own")]),
         (1, [(B, [2], True, "own"), (A, [3], True, "own")]),
@@ -91,14 +89,14 @@ def test_what_the_log_allows_is_not_named(task: Any) -> None:
     assert (forecast(planner).chance is None) == (not can_succeed)
 
 
-def test_calls_that_change_nothing_are_repeated_only_where_that_counts() -> None:
+def test_calls_that_change_nothing_are_repeated_only_where_that_counts():
     walk = [(A, [1], True, "own"), (A, [1], True, "own"), (B, [2], True, "own")]
     log = log_of(["a", "b"], [(0, walk), (0, [(B, [0], False, "own"), *walk])] * 9)
     for task in (Mission(held(at(1), 5), at(2)), Mission(at(2))):
         assert forecast(Planner(log, task)).chance == 1.0
 
 
-def test_goals_of_each_episode_are_judged_by_themselves() -> None:
+def test_goals_of_each_episode_are_judged_by_themselves():
     ends = [(1, 1)] * 8 + [(2, 1)] * 7 + [(2, 2)]
     calls = [(goal, [(A, [[end, goal]], True, "end")]) for goal, end in ends]
     log = log_of(["a"], [([0, goal], call) for goal, call in calls], size=2)
@@ -106,8 +104,8 @@ def test_goals_of_each_episode_are_judged_by_themselves() -> None:
     assert forecast(Planner(log, task)).chance == pytest.approx(9 / 16, abs=0.15)
 
 
-def test_what_is_avoided_and_holds_at_the_start_is_named() -> None:
-    slow: list[Any] = [(A, [0.5, 1], True, "own")]
+def test_what_is_avoided_and_holds_at_the_start_is_named():
+    slow = [(A, [0.5, 1], True, "own")]
     log = log_of(["a"], [(0, slow)] * 18 + [(0, [(A, [1], True, "own")])] * 2)
     expected = forecast(Planner(log, Mission(at(1), avoid=at(0.5))))
     assert expected.chance < 0.2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ def log() -> CallLog:
     )
 
 
-def test_the_matrix_by_hand(log: CallLog) -> None:
+def test_the_matrix_by_hand(log):
     matrix = log.handover()
     assert matrix.before == ("start", "go", "stay")
     # After "go": B won, B lost, A won (though the limit came then). After a lost call: nothing.
@@ -44,8 +43,8 @@ def test_the_matrix_by_hand(log: CallLog) -> None:
     assert any_end.done.tolist() == [[2, 1], [2, 1], [1, 0]]
 
 
-def test_done_may_be_an_event_inside_the_call(log: CallLog) -> None:
-    def at_two(obs: Any) -> Any:
+def test_done_may_be_an_event_inside_the_call(log):
+    def at_two(obs):
         return obs[:, 0] == 2
 
     # "stay" is done where two steps in succession end at 2, "go" where one does.
@@ -55,14 +54,14 @@ def test_done_may_be_an_event_inside_the_call(log: CallLog) -> None:
     assert matrix.cut.tolist() == [1, 1]
 
 
-def test_intervals() -> None:
+def test_intervals():
     low, high = wilson([0, 5, 10, 0], [10, 10, 10, 0])
     # By Wilson's formula with 1.96, worked out elsewhere.
     np.testing.assert_allclose(low, [0, 0.2366, 0.7225, 0], atol=1e-3)
     np.testing.assert_allclose(high, [0.2775, 0.7634, 1, 1], atol=1e-3)
 
 
-def test_it_is_shown_as_a_table(log: CallLog) -> None:
+def test_it_is_shown_as_a_table(log):
     lines = str(log.handover()).splitlines()
     assert lines[0].split() == ["after", "go", "stay"]
     assert lines[2].split("  ")[-1].strip() == "50% of 2 (9% to 91%)"
@@ -91,7 +90,7 @@ def walks(episodes: int, seed: int) -> CallLog:
     return log_of(["there", "on", "back"], found)
 
 
-def test_a_chain_follows_where_calls_end() -> None:
+def test_a_chain_follows_where_calls_end():
     log = walks(600, 0)
     # "on" after "there": from 0 it ends at 1 and fails, from 1 at 2 and succeeds.
     estimate = log.chain("there", "on")
@@ -109,7 +108,7 @@ def test_a_chain_follows_where_calls_end() -> None:
     assert sure.estimate > 0.98
 
 
-def test_the_broken_handover_is_named() -> None:
+def test_the_broken_handover_is_named():
     sentences = walks(600, 1).handover().weakest()
     assert any(
         re.match(r"'on' succeeds in 0% of \d+ calls \(.*\) after 'back'; in", s) for s in sentences
@@ -117,7 +116,7 @@ def test_the_broken_handover_is_named() -> None:
     assert not any(s.startswith("'there'") for s in sentences)
 
 
-def test_a_skill_that_is_never_done_is_the_weakest() -> None:
+def test_a_skill_that_is_never_done_is_the_weakest():
     def never(calls: int, judged: bool = True) -> Handover:
         episode = (0, [(A, [1], True, "own"), (B, [2], False, "limit")])
         return replace(
@@ -132,7 +131,7 @@ def test_a_skill_that_is_never_done_is_the_weakest() -> None:
     assert not never(20, judged=False).weakest()  # perhaps it only ends at its limit
 
 
-def test_what_counts_without_a_success_is_said(log: CallLog) -> None:
+def test_what_counts_without_a_success_is_said(log):
     matrix = log.handover()
     assert matrix.by_itself == ()
     assert str(matrix).endswith("A call is done if it succeeded.")
@@ -144,7 +143,7 @@ def test_what_counts_without_a_success_is_said(log: CallLog) -> None:
     assert any("ends by itself in" in sentence for sentence in broken)
 
 
-def test_sentences_of_chains_and_ends(log: CallLog) -> None:
+def test_sentences_of_chains_and_ends(log):
     assert str(log.chain("go")) == ("go: 67% along the logged calls; 67% as the product 67% of 3")
     assert " then on: " in str(walks(60, 0).chain("back", "there", "on"))
     assert str(log.call_ends("stay")) == (
@@ -176,19 +175,19 @@ def test_sentences_of_chains_and_ends(log: CallLog) -> None:
         ),
     ],
 )
-def test_wrong_arguments_of_handover(log: CallLog, make: Any, kind: Any, message: str) -> None:
+def test_wrong_arguments_of_handover(log, make, kind, message):
     with pytest.raises(kind, match=message):
         make(log)
 
 
-def test_a_chain_whose_next_skill_may_never_start_is_refused(log: CallLog) -> None:
+def test_a_chain_whose_next_skill_may_never_start_is_refused(log):
     may = log.may_follow.copy()
     may[log.skill == A, B] = False
     with pytest.raises(RunError, match=r"'stay' may not start where any logged call of 'go'"):
         replace(log, may_follow=may).chain("go", "stay")
 
 
-def test_a_pair_without_a_call_has_no_product(log: CallLog) -> None:
+def test_a_pair_without_a_call_has_no_product(log):
     assert "no product, as no logged call of 'stay' came right after" in str(
         log.chain("stay", "stay")
     )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from planning.steps import column, step_to
@@ -22,11 +20,11 @@ from skillweave.skills import LastCall, Skill
 A, B, C = (column(i) for i in range(3))
 
 
-def states(task: RewardMachine, state: Any) -> list[str]:
+def states(task: RewardMachine, state) -> list[str]:
     return [task.state_names[i] for i in state[:, 0]]
 
 
-def test_transitions_rewards_and_ends_by_hand() -> None:
+def test_transitions_rewards_and_ends_by_hand():
     task = RewardMachine(
         {
             ("one", "two"): (A, 0.25),
@@ -51,7 +49,7 @@ def test_transitions_rewards_and_ends_by_hand() -> None:
     assert task.has_succeeded(state).tolist() == [True, False, False, False]
 
 
-def test_a_counter_counts_steps_without_a_gap_and_only_in_its_state() -> None:
+def test_a_counter_counts_steps_without_a_gap_and_only_in_its_state():
     task = RewardMachine({("a", "b"): A, ("b", "c"): held(B, 3)}, accepting={"c"})
     state = task.start(1)
     seen = []
@@ -65,7 +63,7 @@ def test_a_counter_counts_steps_without_a_gap_and_only_in_its_state() -> None:
     ]  # fmt: skip
 
 
-def test_several_counters_in_one_state() -> None:
+def test_several_counters_in_one_state():
     task = RewardMachine({("a", "x"): held(A, 2), ("a", "y"): held(B, 3)}, accepting={"x", "y"})
     state = task.start(3)
     for rows in ([[1, 1], [0, 1], [1, 0]], [[0, 1], [0, 1], [0, 1]], [[1, 1], [1, 1], [1, 1]]):
@@ -75,8 +73,8 @@ def test_several_counters_in_one_state() -> None:
     assert done.tolist() == [True, True, False]
 
 
-def test_rewards_may_be_functions_of_a_step() -> None:
-    def fast(step: Any) -> Any:
+def test_rewards_may_be_functions_of_a_step():
+    def fast(step):
         return step.next_obs[:, 0] - step.obs[:, 0]
 
     task = RewardMachine(
@@ -94,12 +92,12 @@ def test_rewards_may_be_functions_of_a_step() -> None:
     assert reward.tolist() == [5.0, 0.0]  # a task that is over pays nothing
 
 
-def test_predicates_of_steps_and_of_observations() -> None:
-    def moved(step: Any) -> Any:
+def test_predicates_of_steps_and_of_observations():
+    def moved(step):
         return step.next_obs[:, 0] != step.obs[:, 0]
 
     class Stand(Skill):
-        def success(self, step: Any) -> Any:
+        def success(self, step):
             return step.next_obs[:, 1] == 1
 
     step = step_to([[1, 1], [0, 1]])
@@ -116,7 +114,7 @@ def test_predicates_of_steps_and_of_observations() -> None:
         Predicate(moved).at(step.obs)
 
 
-def test_what_a_policy_sees_of_a_task() -> None:
+def test_what_a_policy_sees_of_a_task():
     task = RewardMachine({("a", "b"): held(A, 4), ("b", "c"): held(B, 2)}, accepting={"c"})
     seen = task.observe(np.array([[0, 3], [1, 1], [2, 0]]))
     assert seen.tolist() == [[1, 0, 0, 0.75], [0, 1, 0, 0.5], [0, 0, 1, 0]]
@@ -139,7 +137,7 @@ TASKS = {
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_its_automaton_is_in_the_same_states(name: str) -> None:
+def test_its_automaton_is_in_the_same_states(name):
     task = TASKS[name]
     skills = {"a": "go_a", "b": ["go_b", "wait"], "c": "no", "d": "go_d", "e": "go_d"}
     automaton = task.automaton(skills).among(("go_a", "go_b", "wait", "no", "go_d"))
@@ -162,7 +160,7 @@ def test_its_automaton_is_in_the_same_states(name: str) -> None:
     assert len(seen) > 5
 
 
-def test_the_skills_of_its_automaton() -> None:
+def test_the_skills_of_its_automaton():
     skills = {"a": "go_a", "b": ["go_b", "wait"], "c": "no", "d": "go_d", "e": "go_d"}
     automaton = TASKS["several transitions"].automaton(skills)
     assert automaton.states["a"] == ("go_a",)
@@ -221,17 +219,17 @@ def test_the_skills_of_its_automaton() -> None:
         ),
     ],
 )
-def test_a_wrong_machine_is_refused(make: Any, message: str) -> None:
+def test_a_wrong_machine_is_refused(make, message):
     with pytest.raises(DeclarationError, match=message):
         make()
 
 
-def test_control_characters_in_names_of_states_are_escaped() -> None:
+def test_control_characters_in_names_of_states_are_escaped():
     assert "\x1b" not in repr(RewardMachine({("a\x1b[2J", "b\n"): A}))
 
 
-def test_a_predicate_that_answers_wrongly_is_named() -> None:
-    def bad(obs: Any) -> Any:
+def test_a_predicate_that_answers_wrongly_is_named():
+    def bad(obs):
         return obs
 
     task = RewardMachine({("a", "b"): bad})

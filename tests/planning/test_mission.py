@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,12 +32,12 @@ NAMES = {"abcd"[i]: p for i, p in enumerate(P)}
 class Part:
     """One part of a mission, followed step by step."""
 
-    def __init__(self, tree: Any) -> None:
+    def __init__(self, tree):
         self.kind, self.tree, self.count, self.at = tree[0], tree, 0, 0
         self.parts = [Part(t) for t in tree[1]] if self.kind in ("then", "or", "and") else []
         self.done = False
 
-    def step(self, row: Any) -> None:
+    def step(self, row):
         if self.kind == "leg":
             self.count = self.count + 1 if row[self.tree[1]] else 0
             self.done = self.count >= self.tree[2]
@@ -60,7 +59,7 @@ class Part:
         return max(shares) if self.kind == "or" else sum(shares) / len(shares)
 
 
-def legs(tree: Any) -> Any:
+def legs(tree):
     """A mission's part of a tree."""
     if tree[0] == "leg":
         return held(P[tree[1]], tree[2])
@@ -70,7 +69,7 @@ def legs(tree: Any) -> Any:
     )
 
 
-def text(tree: Any) -> str:
+def text(tree) -> str:
     if tree[0] == "leg":
         return "abcd"[tree[1]] + (f" for {tree[2]} steps" if tree[2] > 1 else "")
     return "(" + f" {tree[0]} ".join(text(t) for t in tree[1]) + ")"
@@ -86,7 +85,7 @@ TREE = st.recursive(
 )
 
 
-def flat(tree: Any) -> Any:
+def flat(tree):
     """A tree whose sequences in sequences are joined, as missions join them."""
     if tree[0] == "leg":
         return tree
@@ -97,7 +96,7 @@ def flat(tree: Any) -> Any:
 
 
 @given(TREE, st.booleans(), st.integers(0, 2**31))
-def test_a_mission_is_followed_as_its_parts_are(tree: Any, avoids: bool, seed: int) -> None:
+def test_a_mission_is_followed_as_its_parts_are(tree, avoids, seed):
     how = {"avoid": column(4)} if avoids else {}
     task, reason = None, ""
     try:
@@ -131,7 +130,7 @@ def test_a_mission_is_followed_as_its_parts_are(tree: Any, avoids: bool, seed: i
         assert done.tolist() == [r.done or f for r, f in zip(references, failed, strict=True)]
 
 
-def test_a_mission_that_repeats() -> None:
+def test_a_mission_that_repeats():
     twice = Mission(P[0], P[1], repeat=2)
     assert twice.state_names == ("a", "b", "a #2", "b #2", "done")
     forever = Mission(P[0], P[1], repeat=None, avoid=P[2])
@@ -146,9 +145,9 @@ def test_a_mission_that_repeats() -> None:
     assert Mission(twice, P[2]).state_names == ("a", "b", "a #2", "b #2", "c", "done")
 
 
-def test_it_pays_as_the_landers_missions_do() -> None:
-    def box(kind: int) -> Any:
-        def inside(obs: Any) -> Any:
+def test_it_pays_as_the_landers_missions_do():
+    def box(kind: int):
+        def inside(obs):
             return (np.abs(obs[:, :2] - POINTS[kind]) <= HALF[kind] + 1e-6).all(axis=1)
 
         inside.__name__ = KINDS[kind]
@@ -177,7 +176,7 @@ def test_it_pays_as_the_landers_missions_do() -> None:
         assert total.min() < 0.99
 
 
-def test_texts_and_what_they_mean() -> None:
+def test_texts_and_what_they_mean():
     assert Mission.from_text("a then b or c and d", NAMES).state_names == (
         "a", "b or c and d", "b or d", "b or c", "done",
     )  # fmt: skip
@@ -216,7 +215,7 @@ def test_texts_and_what_they_mean() -> None:
         (" then ".join(["a", "b"] * 40 + ["bb"]), "is 'b' meant", "bb"),
     ],
 )
-def test_an_error_points_at_the_word(text: str, reason: str, word: str) -> None:
+def test_an_error_points_at_the_word(text, reason, word):
     with pytest.raises(DeclarationError, match=reason) as caught:
         Mission.from_text(text, NAMES | {"stay": held(P[0], 5)})
     _, line, pointer = str(caught.value).split("\n")
@@ -235,12 +234,12 @@ def test_an_error_points_at_the_word(text: str, reason: str, word: str) -> None:
         ("((a or b or c or d) and (a or b or c or d)) repeat 1000", "transitions"),
     ],
 )
-def test_a_text_that_means_too_much_is_refused_before_it_is_built(text: str, noun: str) -> None:
+def test_a_text_that_means_too_much_is_refused_before_it_is_built(text, noun):
     with pytest.raises(DeclarationError, match=noun):
         Mission.from_text(text, NAMES)
 
 
-def test_equal_names_are_numbered_in_linear_time() -> None:
+def test_equal_names_are_numbered_in_linear_time():
     start = time.process_time()
     names = Mission.from_text("(a then b) repeat 1000", NAMES).state_names
     assert time.process_time() - start < 2
@@ -274,12 +273,12 @@ def test_equal_names_are_numbered_in_linear_time() -> None:
         (lambda: GoalTask(column(0), columns=(7,)).of(np.zeros((1, 3))), "have 3 numbers"),
     ],
 )
-def test_a_wrong_mission_is_refused(make: Any, message: str) -> None:
+def test_a_wrong_mission_is_refused(make, message):
     with pytest.raises(DeclarationError, match=message):
         make()
 
 
-def test_a_task_of_anything_that_means_one() -> None:
+def test_a_task_of_anything_that_means_one():
     task = Mission(P[0])
     assert as_task(task) is task
     assert as_task("a then b", NAMES).state_names == ("a", "b", "done")
@@ -292,11 +291,11 @@ def test_a_task_of_anything_that_means_one() -> None:
     assert (reward.tolist(), done.tolist(), state.tolist()) == ([3, 4], [False] * 2, [[0], [0]])
 
 
-def near(obs: Any, goal: Any) -> Any:
+def near(obs, goal):
     return np.abs(obs[:, 0] - goal[..., 0]) < 0.5
 
 
-def test_goals() -> None:
+def test_goals():
     own = GoalTask(near, columns=(1,))
     obs = np.array([[0, 3], [0, 0]], np.float32)
     assert own.of(obs).tolist() == [[3], [0]]
@@ -315,10 +314,10 @@ def test_goals() -> None:
 @pytest.mark.parametrize(
     "legs", [(P[0],), (P[1], [P[2], held(P[0], 3)]), (in_any_order(P[1], P[0]),)]
 )
-def test_what_must_be_done_and_avoided_is_refused(legs: Any) -> None:
+def test_what_must_be_done_and_avoided_is_refused(legs):
     with pytest.raises(DeclarationError, match="must be done and must be avoided"):
         Mission(*legs, avoid=P[0])
 
 
-def test_one_of_several_ways_may_be_avoided() -> None:
+def test_one_of_several_ways_may_be_avoided():
     assert Mission(either(P[1], P[0]), avoid=P[0]).avoid == (P[0],)

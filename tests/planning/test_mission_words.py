@@ -1,9 +1,5 @@
 """The words of a mission's text: names of skills, the hierarchy's own words, and given ones."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from planning.untrained import run_of
@@ -15,20 +11,20 @@ from skillweave.errors import DeclarationError
 class Then(Wait):
     name = "then"  # a word of missions
 
-    def success(self, step: Any) -> Any:
+    def success(self, step):
         return np.ones(len(step.reward), bool)
 
 
 class ToKey(GetKey):
-    def success(self, step: Any) -> Any:
+    def success(self, step):
         return step.next_obs[:, 1] == 1
 
 
-def at_five(obs: Any) -> Any:
+def at_five(obs):
     return obs[:, PLACE] == 5
 
 
-def test_skills_names_mean_their_success_and_a_hierarchy_has_words() -> None:
+def test_skills_names_mean_their_success_and_a_hierarchy_has_words():
     run = run_of(ToKey(), OpenDoor(), Then(), predicates={"four": at_four})
     log = run.log_calls(2_000, info=("door",))
     planned = run.plan("to_key then four")
@@ -53,6 +49,6 @@ def test_skills_names_mean_their_success_and_a_hierarchy_has_words() -> None:
         (at_four, "predicates is "),
     ],
 )
-def test_wrong_words_are_refused_where_they_are_declared(words: Any, says: str) -> None:
+def test_wrong_words_are_refused_where_they_are_declared(words, says):
     with pytest.raises(DeclarationError, match=says):
         run_of(ToKey(), OpenDoor(), Then(), predicates=words)

@@ -21,7 +21,7 @@ class Last(First):
         return step.terminated | step.truncated
 
 
-def test_a_call_that_ends_by_itself_with_the_episode_is_done() -> None:
+def test_a_call_that_ends_by_itself_with_the_episode_is_done():
     env = sw.EnvSpec(Walk, engine="sync", workers=1)
     choose = lambda obs: np.where(obs[:, T] < 2, "first", "last")  # noqa: E731
     hierarchy = sw.Hierarchy(env, [First(), Last()], call_steps=None, selector=choose)

@@ -18,7 +18,7 @@ from skillweave.policies.planned import Planned
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.spaces import obs_dtype
 
-LINE: Any = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+LINE = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
 
 
 def line(lengths: tuple[int, ...] = ()) -> CallLog:
@@ -50,21 +50,21 @@ def aimed() -> CallLog:
     return log
 
 
-def reward(step: Any) -> Any:
+def reward(step):
     return step.next_obs[:, 0] / 10
 
 
-def columns_near(obs: Any, goal: Any) -> Any:
+def columns_near(obs, goal):
     return np.abs(obs[:, 0] - np.round(np.abs(goal[..., 0]))) < 0.3
 
 
-def bound(space: Any = LINE) -> Planner:
+def bound(space=LINE) -> Planner:
     planner = Planner(aimed(), Mission(at(9), at(1)), neighbors=2).among(("go",))
     choices = choice_space(1, {"go": space}, ["go"])
     return planner.bind(planner.log.observation_space, choices, "selector")
 
 
-PLANS: dict[str, Any] = {
+PLANS = {
     "mission": lambda: Planner(line(), Mission(at(9), held(at(1), 3), at(9))),
     "reward": lambda: Planner(
         line(), RewardMachine({("on", "there"): (at(9), 1.0)}, each_step={"there": reward})
@@ -77,7 +77,7 @@ PLANS: dict[str, Any] = {
 }
 
 
-def course(plans: Planned, log: CallLog, rows_of: Any, n: int = 5) -> list[Any]:
+def course(plans: Planned, log: CallLog, rows_of, n: int = 5) -> list[Any]:
     """What it chooses and remembers in ``n`` environments, where calls often lead nowhere.
 
     Args:
@@ -106,12 +106,12 @@ def course(plans: Planned, log: CallLog, rows_of: Any, n: int = 5) -> list[Any]:
     return [found, {name: value.tolist() for name, value in flat(memory).items()}]
 
 
-def together(rows: Any) -> list[Any]:
+def together(rows) -> list[Any]:
     return [rows] if len(rows) else []
 
 
 @pytest.mark.parametrize("name", PLANS)
-def test_rows_are_as_one_environment_each(name: str) -> None:
+def test_rows_are_as_one_environment_each(name):
     planner = PLANS[name]()
     plans, log = planner.in_place, planner.log
     many = course(plans, log, together)
@@ -131,14 +131,14 @@ def bare(plans: Planned) -> Planned:
 
 
 @pytest.mark.parametrize("name", [name for name in PLANS if "observations" not in name])
-def test_its_data_are_all_that_it_needs(name: str) -> None:
+def test_its_data_are_all_that_it_needs(name):
     planner = PLANS[name]()
     plans, log = planner.in_place, planner.log
     assert type(plans) is Planned
     assert str(course(bare(plans), log, together)) == str(course(plans, log, together))
 
 
-def test_choices_with_goals_are_records_of_a_choice_space() -> None:
+def test_choices_with_goals_are_records_of_a_choice_space():
     planner = bound()
     plans = planner.in_place
     choice = plans.act(plans.start(3), np.arange(3), np.float32([[2], [5], [9]]), Turn(World()))
@@ -148,14 +148,14 @@ def test_choices_with_goals_are_records_of_a_choice_space() -> None:
         plans.record(np.array([0]), np.array([-1]), np.float32([[2]]))
 
 
-def test_how_likely_choices_are() -> None:
+def test_how_likely_choices_are():
     plans = PLANS["mission"]().in_place
     may = np.ones((1, 6), bool)  # with three lengths, which it does not choose
     chances = plans.chances(plans.start(1), np.arange(1), np.float32([[2, 0]]), may)
     assert chances[0].tolist() == pytest.approx([0, 0, 0, 1 / 3, 1 / 3, 1 / 3])
 
 
-def changed(x: Any, path: str, value: Any) -> Any:
+def changed(x, path: str, value):
     """A copy of data in which the part at a path has another value, or a function's of it."""
     name, _, rest = path.partition(".")
     old = (
@@ -202,6 +202,6 @@ def changed(x: Any, path: str, value: Any) -> Any:
         ("levels.levels", lambda x: np.ones((len(x), 9), int), "spacing of a plan"),
     ],
 )
-def test_data_that_contradict_one_another_are_refused(path: str, value: Any, message: str) -> None:
+def test_data_that_contradict_one_another_are_refused(path, value, message):
     with pytest.raises(PolicyError, match=message):
         changed(bound().in_place, path, value)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -22,12 +20,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:this plan has a chance")  # noth
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: Any) -> None:
+def quick(monkeypatch):
     monkeypatch.setattr("skillweave.training.imitation.GRADIENT_STEPS", 50)
     monkeypatch.setattr("skillweave.api.planning.PAIRS", 200)
 
 
-def pushes(seen: Any) -> Any:
+def pushes(seen):
     """Return other pushes of the arm in each step, which only its start and steps decide."""
     return 0.3 * np.cos(7 * seen["arm"])
 
@@ -38,11 +36,11 @@ class Bends(sw.Skill):
     sees, acts = {"arm": "arm"}, (2, 0)
     policy = sw.Residual(sw.from_function(pushes, every=2), scale=0.5)
 
-    def reward(self, step: sw.Step) -> Any:
+    def reward(self, step: sw.Step):
         return -np.abs(step.next_obs["arm"]).sum(axis=1)
 
 
-def own(kind: type[sw.Skill], **fields: Any) -> sw.Skill:
+def own(kind: type[sw.Skill], **fields) -> sw.Skill:
     return type(kind.__name__, (kind,), fields)()
 
 
@@ -51,7 +49,7 @@ def nested() -> sw.Hierarchy:
 
 
 SPEC = sw.EnvSpec(Crane, engine="sync", workers=1)
-CASES: dict[str, Any] = {
+CASES = {
     "sees and acts": lambda: Arm(),
     "acts": lambda: own(Arm, sees=None),
     "sees": lambda: own(Arm, acts=None),
@@ -62,18 +60,18 @@ CASES: dict[str, Any] = {
 }
 
 
-def plan(run: Any) -> Any:
+def plan(run):
     return run.plan(TASK, run.log_calls(200, num_envs=2), features=lambda obs: obs["arm"])
 
 
-def whole(obs: Any) -> Any:
+def whole(obs):
     return np.concatenate([pushes(obs), -obs["hook"]], axis=1)
 
 
 @pytest.mark.filterwarnings("ignore:these skills have a memory")
 @pytest.mark.fast_cases(3)
 @pytest.mark.parametrize("make", CASES.values(), ids=CASES)
-def test_skills_act_as_before(make: Any) -> None:
+def test_skills_act_as_before(make):
     """Under a selector of one skill nothing else decides what is done."""
     skill = make()
     rest = {} if getattr(skill, "acts", None) is None else {"rest": ("hold", 0.25, 0.5)}
@@ -93,11 +91,11 @@ def test_skills_act_as_before(make: Any) -> None:
                 break
 
 
-def test_a_skill_with_a_part_keeps_its_goals() -> None:
+def test_a_skill_with_a_part_keeps_its_goals():
     class Reach(Arm):
         goal_space = gym.spaces.Box(-1, 1, (2,), np.float32)
 
-        def reward(self, step: sw.Step) -> Any:
+        def reward(self, step: sw.Step):
             return -np.abs(step.next_obs["arm"] - step.goal).sum(axis=1)
 
     run = crane([Reach(), Hook()], env=SPEC, selection=GREEDY).train(quiet=True)

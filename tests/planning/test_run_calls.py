@@ -7,8 +7,6 @@ import shutil
 import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,12 +21,12 @@ from skillweave.runs.directory import CALLS, RunDirectory
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def trained(tmp_path_factory) -> Run:
     return declare(Left(), Right()).train(tmp_path_factory.mktemp("calls") / "run", quiet=True)
 
 
 @pytest.fixture
-def run(trained: Run, tmp_path: Path) -> Run:
+def run(trained, tmp_path) -> Run:
     return sw.load(shutil.copytree(trained.path, tmp_path / "run"), declare(Left(), Right()))
 
 
@@ -36,11 +34,11 @@ def same(a: CallLog, b: CallLog) -> bool:
     return len(a) == len(b) and all((a.choice == b.choice, a.next_obs == b.next_obs)[0])
 
 
-def tilted(obs: Any) -> Any:
+def tilted(obs):
     return obs[:, 2] > 0.05
 
 
-def test_calls_are_kept_and_joined(run: Run) -> None:
+def test_calls_are_kept_and_joined(run):
     with pytest.raises(RunError, match=r"has no log of calls; record a new log: run.log_calls"):
         run.calls  # noqa: B018
     first = run.log_calls(300)
@@ -53,7 +51,7 @@ def test_calls_are_kept_and_joined(run: Run) -> None:
     assert np.unique(again.episode).tolist() == list(range(again.episode.max() + 1))
 
 
-def test_the_same_recording_is_kept_once(run: Run) -> None:
+def test_the_same_recording_is_kept_once(run):
     first = run.log_calls(200, seed=3)
     longer = run.log_calls(400, seed=3)
     assert same(longer.take(np.arange(10)), first.take(np.arange(10)))
@@ -64,7 +62,7 @@ def test_the_same_recording_is_kept_once(run: Run) -> None:
     assert run.calls.steps > longer.steps + 400 - 1
 
 
-def test_episodes_are_played_again_from_their_seeds(run: Run) -> None:
+def test_episodes_are_played_again_from_their_seeds(run):
     log = run.log_calls(300, num_envs=3)
     engine = GymnasiumEngine(run.declaration.spec.make, 1, "CartPole")
     row = np.arange(1)
@@ -80,7 +78,7 @@ def test_episodes_are_played_again_from_their_seeds(run: Run) -> None:
     engine.close()
 
 
-def test_a_plan_uses_the_runs_own_calls(run: Run) -> None:
+def test_a_plan_uses_the_runs_own_calls(run):
     with pytest.raises(RunError, match="has no log of calls"):
         run.plan(tilted)
     log = run.log_calls(1_000)
@@ -89,7 +87,7 @@ def test_a_plan_uses_the_runs_own_calls(run: Run) -> None:
     )
 
 
-def test_keys_of_info_of_earlier_calls_are_recorded_again() -> None:
+def test_keys_of_info_of_earlier_calls_are_recorded_again():
     hierarchy = declare(Left())
     hierarchy.env = sw.EnvSpec(Informed, engine="sync", workers=1)
     run = hierarchy.train(quiet=True)
@@ -102,13 +100,13 @@ def test_keys_of_info_of_earlier_calls_are_recorded_again() -> None:
     assert first.steps > 0
 
 
-class Informed(sw.EnvSpec("CartPole-v1").make().unwrapped.__class__):  # type: ignore[misc]
-    def step(self, action: Any) -> Any:
+class Informed(sw.EnvSpec("CartPole-v1").make().unwrapped.__class__):
+    def step(self, action):
         obs, reward, over, cut, _ = super().step(action)
         return obs, reward, over, cut, {"half": obs[0] / 2, "third": obs[0] / 3}
 
 
-def test_calls_of_skills_that_learnt_on_are_not_used(run: Run) -> None:
+def test_calls_of_skills_that_learnt_on_are_not_used(run):
     old = run.log_calls(300)
     more = declare(Left(), Right())
     more.apart = sw.Apart(skill_steps=200, selector_steps=100)
@@ -127,14 +125,14 @@ def test_calls_of_skills_that_learnt_on_are_not_used(run: Run) -> None:
         run.calls  # noqa: B018
 
 
-def test_the_selector_may_learn_on(run: Run) -> None:
+def test_the_selector_may_learn_on(run):
     log = run.log_calls(100)
     more = declare(Left(), Right())
     more.apart = sw.Apart(skill_steps=100, selector_steps=200)
     assert same(more.train(run.path, resume=True, quiet=True).calls, log)
 
 
-def test_a_run_keeps_its_latest_calls(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_keeps_its_latest_calls(run, monkeypatch):
     monkeypatch.setattr(run_log, "MOST_STEPS", 250)
     run.log_calls(200)
     with pytest.warns(UserWarning, match="keeps its latest 250 logged steps"):
@@ -144,7 +142,7 @@ def test_a_run_keeps_its_latest_calls(run: Run, monkeypatch: pytest.MonkeyPatch)
     assert (kept.next_obs[-100:] == second.next_obs[-100:]).all()
 
 
-def test_a_damaged_file_is_neither_used_nor_replaced(run: Run) -> None:
+def test_a_damaged_file_is_neither_used_nor_replaced(run):
     path = run.path / CALLS
     path.write_bytes(b"no log")
     for use in (lambda: run.calls, lambda: run.log_calls(10)):
@@ -162,7 +160,7 @@ def test_a_damaged_file_is_neither_used_nor_replaced(run: Run) -> None:
         run.log_calls(10)
 
 
-def test_without_a_directory_calls_stay_in_memory(run: Run, tmp_path: Path) -> None:
+def test_without_a_directory_calls_stay_in_memory(run, tmp_path):
     weights = run.save_weights(tmp_path / "weights.safetensors")
     loaded = declare(Left(), Right()).load_weights(weights)
     log = loaded.log_calls(200)
@@ -173,10 +171,8 @@ def test_without_a_directory_calls_stay_in_memory(run: Run, tmp_path: Path) -> N
     loaded.plan(tilted)
 
 
-def test_calls_that_cannot_be_written_stay_in_memory_until_they_can(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: Any) -> Any:
+def test_calls_that_cannot_be_written_stay_in_memory_until_they_can(run, monkeypatch):
+    def full(*_):
         raise RunError("disk full")
 
     steps = run.log_calls(100).steps
@@ -190,8 +186,8 @@ def test_calls_that_cannot_be_written_stay_in_memory_until_they_can(
     assert same(run.calls, declare(Left(), Right()).load(run.path).calls)
 
 
-def test_two_that_log_at_once_lose_no_calls(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    def slow(*args: Any) -> None:
+def test_two_that_log_at_once_lose_no_calls(run, monkeypatch):
+    def slow(*args):
         time.sleep(0.2)
         write(*args)
 
@@ -205,10 +201,10 @@ def test_two_that_log_at_once_lose_no_calls(run: Run, monkeypatch: pytest.Monkey
     assert len(run.calls) == sum(map(len, logs))
 
 
-def test_an_interrupted_recording_keeps_its_calls(run: Run) -> None:
+def test_an_interrupted_recording_keeps_its_calls(run):
     asked = 0
 
-    def choose(obs: Any) -> Any:
+    def choose(obs):
         nonlocal asked
         asked += 1
         if asked == 100:
@@ -221,14 +217,14 @@ def test_an_interrupted_recording_keeps_its_calls(run: Run) -> None:
     assert (run.calls.end_reason > 0).all()
 
 
-def test_a_plain_agent_has_no_calls() -> None:
+def test_a_plain_agent_has_no_calls():
     env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
     agent = sw.train_agent(env, SMALL, 100, quiet=True)
     with pytest.raises(DeclarationError, match="plain agent"):
         agent.calls  # noqa: B018
 
 
-def test_calls_without_the_skills_code_are_replaced_by_calls_with_it(run: Run) -> None:
+def test_calls_without_the_skills_code_are_replaced_by_calls_with_it(run):
     sw.load(run.path).log_calls(100)
     assert run.calls.own_success == (False, False)
     with pytest.warns(UserWarning, match=r"is replaced by the new one: .*success\(\) was known"):

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from planning.untrained import run_of
@@ -37,7 +34,7 @@ from skillweave.planning.mission import as_task
 from skillweave.planning.task_env import Tasked, TaskEnv
 
 
-def door_open(step: Any) -> Any:
+def door_open(step):
     return step.info["door"] == 1
 
 
@@ -47,11 +44,11 @@ def run() -> Run:
 
 
 @pytest.fixture(scope="module")
-def log(run: Run) -> CallLog:
+def log(run) -> CallLog:
     return run.log_calls(6_000, seed=1, info=("door",))
 
 
-def test_a_new_task_is_planned_and_scored_by_itself(run: Run, log: CallLog) -> None:
+def test_a_new_task_is_planned_and_scored_by_itself(run, log):
     assert run.evaluate(10, quiet=True).mean == 0.0
     planned = run.plan(Mission(at_four, door_open, held(at_four, 2)), log)
     score = planned.evaluate(20, quiet=True)
@@ -69,14 +66,8 @@ def test_a_new_task_is_planned_and_scored_by_itself(run: Run, log: CallLog) -> N
     assert (round(paid, 6), info["success"], info["env_reward"]) == (1.0, True, 0.0)
 
 
-def test_a_text_is_a_task(run: Run, log: CallLog) -> None:
-    words = {"four": at_four, "door": door_open}
-    planned = run.plan("four then door then four", log, predicates=words)
-    assert planned.evaluate(20, quiet=True).success_rate == 1.0
-
-
-def test_a_reward_alone_has_no_success(run: Run, log: CallLog) -> None:
-    def far(step: Any) -> Any:
+def test_a_reward_alone_has_no_success(run, log):
+    def far(step):
         return step.next_obs[:, PLACE] / 100
 
     planned = run.plan(far, log)
@@ -86,8 +77,8 @@ def test_a_reward_alone_has_no_success(run: Run, log: CallLog) -> None:
     assert score.mean > 1.2 * run.plan(at_four, log).evaluate(1, quiet=True).mean
 
 
-def test_what_cannot_be_planned_is_refused(run: Run, log: CallLog, tmp_path: Path) -> None:
-    def at_nine(obs: Any) -> Any:
+def test_what_cannot_be_planned_is_refused(run, log, tmp_path):
+    def at_nine(obs):
         return obs[:, PLACE] == 9
 
     with pytest.raises(RunError, match="at_nine"):
@@ -118,10 +109,10 @@ def test_what_cannot_be_planned_is_refused(run: Run, log: CallLog, tmp_path: Pat
         agent.log_calls(10)
 
 
-def test_the_environment_of_a_task_by_hand() -> None:
+def test_the_environment_of_a_task_by_hand():
     """Each step is judged on the observation before and after; a goal, and parts of a dict."""
 
-    def came_to_six(step: Any) -> Any:
+    def came_to_six(step):
         return (step.obs["at"][:, 0] == 5) & (step.next_obs["at"][:, 0] == 6)
 
     env = Tasked(as_task(Mission(came_to_six)))(InDict(Corridor()))
@@ -137,7 +128,7 @@ def test_the_environment_of_a_task_by_hand() -> None:
             assert over == info["success"] == (len(rewards) == 6 - start)
         assert rewards == [0.0] * (5 - start) + [1.0]
 
-    def there(obs: Any, goal: Any) -> Any:
+    def there(obs, goal):
         return np.abs(obs[:, :1] - goal).max(1) < 0.5
 
     env = Tasked(GoalTask(there, goal=[6.0]))(Corridor())
@@ -148,11 +139,11 @@ def test_the_environment_of_a_task_by_hand() -> None:
     assert reached(there, [6.0]).at(np.array([[6.0, 0, 0]])).tolist() == [True]
 
 
-def test_tasks_and_skills_go_by_the_environments_own_reward_and_success() -> None:
+def test_tasks_and_skills_go_by_the_environments_own_reward_and_success():
     """The score of a planned run is the task's; what is planned and played is not judged by it."""
 
     class Paying(Corridor):
-        def step(self, action: int) -> Any:
+        def step(self, action: int):
             obs, _, _, cut, info = super().step(action)
             self.door = 1  # there is a way behind the wall
             info["success"] = self.place == 4
@@ -161,16 +152,16 @@ def test_tasks_and_skills_go_by_the_environments_own_reward_and_success() -> Non
     class ToPay(Leave):
         max_steps = 9
 
-        def termination(self, step: Any) -> Any:
+        def termination(self, step):
             return step.reward > 5
 
     class Back(ToPay):
         policy = GetKey.policy
 
-    def paid(step: Any) -> Any:
+    def paid(step):
         return step.reward > 5
 
-    def won(step: Any) -> Any:
+    def won(step):
         return step.info["success"]
 
     rule = lambda obs: ["wait"] * len(obs)  # noqa: E731
@@ -193,12 +184,12 @@ def test_tasks_and_skills_go_by_the_environments_own_reward_and_success() -> Non
         (lambda obs: ["nobody"] * len(obs), "nobody"),
     ],
 )
-def test_what_cannot_choose_is_refused(run: Run, choose: Any, says: str) -> None:
+def test_what_cannot_choose_is_refused(run, choose, says):
     with pytest.raises(SkillweaveError, match=says):
         run.log_calls(50, choose=choose)
 
 
-def test_functions_choose(run: Run) -> None:
+def test_functions_choose(run):
     log = run.log_calls(50, choose=lambda obs: ["wait"] * len(obs))
     assert set(log.choice) == {3}
     with pytest.raises(DeclarationError, match=r"info is 'door'; it must be a list"):

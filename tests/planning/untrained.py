@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from ready_selectors.chain import SPEC, GetKey, Leave, OpenDoor, Wait, bound
 
@@ -15,11 +14,11 @@ from skillweave.skills.foreign_policy import fitted
 from skillweave.skills.skill_set import SkillSet
 
 
-def run_of(*skills: Any, spec: sw.EnvSpec = SPEC, **how: Any) -> Run:
+def run_of(*skills, spec: sw.EnvSpec = SPEC, **how) -> Run:
     """A run whose selector always calls the first skill, if no other is given."""
     skills = skills or (GetKey(), OpenDoor(), Leave(), Wait())
     names = tuple(s.name for s in skills)
-    rule: Any = {"call_steps": None, "selector": lambda obs: [names[0]] * len(obs)}
+    rule = {"call_steps": None, "selector": lambda obs: [names[0]] * len(obs)}
     declared = sw.Hierarchy(spec, skills, **rule | how)
     ready = tuple(fitted(ready_policy(s), *spec.spaces, s.name, "corridor") for s in skills)
     skill_set = SkillSet(skills, ready, tuple(declared.reflexes))

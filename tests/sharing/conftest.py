@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from hub_server import Hub, go_to, serve
@@ -14,7 +13,7 @@ import skillweave as sw
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> sw.Run:
+def trained(tmp_path_factory) -> sw.Run:
     """A run with an evaluation and a film."""
     path = tmp_path_factory.mktemp("trained") / "run"
     run = declare(Left(), Right()).train(path, quiet=True)
@@ -24,7 +23,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> sw.Run:
 
 
 @pytest.fixture
-def run(trained: sw.Run, tmp_path: Path) -> sw.Run:
+def run(trained, tmp_path) -> sw.Run:
     """A copy of it, which a test may change; without curves, which take long to draw."""
     shutil.copytree(trained.path, tmp_path / "run")
     (tmp_path / "run/metrics.jsonl").unlink()
@@ -32,7 +31,7 @@ def run(trained: sw.Run, tmp_path: Path) -> sw.Run:
 
 
 @pytest.fixture
-def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+def hub(tmp_path, monkeypatch) -> Iterator[Hub]:
     with serve() as found:
         go_to(found.url, tmp_path / "cache", monkeypatch)
         yield found

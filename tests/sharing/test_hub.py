@@ -1,15 +1,12 @@
 """Runs pushed to a hub on this machine, and loaded from there."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-from hub_server import Hub, go_to
+from hub_server import go_to
 from shared_runs import NAME, SMALL, Left, Right, declare, files_of, same_actions
 
 import skillweave as sw
@@ -33,7 +30,7 @@ class Careful(sw.Skill):
 # There and back
 
 
-def test_a_run_that_was_pushed_acts_the_same_where_it_is_loaded(run: sw.Run, hub: Hub) -> None:
+def test_a_run_that_was_pushed_acts_the_same_where_it_is_loaded(run, hub):
     told = run.push(NAME)
     assert told["url"] == f"{hub.url}/{NAME}"
     assert told["commit"] == hub.repos[NAME].commits[-1].sha
@@ -45,9 +42,7 @@ def test_a_run_that_was_pushed_acts_the_same_where_it_is_loaded(run: sw.Run, hub
     assert same_actions(run, sw.from_hub(NAME))
 
 
-def test_all_goes_up_in_one_commit_and_nothing_but_data(
-    run: sw.Run, trained: sw.Run, hub: Hub
-) -> None:
+def test_all_goes_up_in_one_commit_and_nothing_but_data(run, trained, hub):
     pytest.importorskip("matplotlib")
     shutil.copy(trained.path / "metrics.jsonl", run.path)
     for name in ("notes.txt", "train.py", "checkpoint.safetensors", "report.html"):
@@ -61,7 +56,7 @@ def test_all_goes_up_in_one_commit_and_nothing_but_data(
     assert told["missing"] == []
 
 
-def test_calls_go_up_if_asked(run: sw.Run, hub: Hub) -> None:
+def test_calls_go_up_if_asked(run, hub):
     with pytest.raises(RunError, match="has no log of calls"):
         run.push(NAME, calls=True)
     log = run.log_calls(200)
@@ -84,7 +79,7 @@ def test_calls_go_up_if_asked(run: sw.Run, hub: Hub) -> None:
     assert "calls.safetensors" not in hub.files(NAME)
 
 
-def test_what_a_run_has_not_is_said(run: sw.Run, hub: Hub) -> None:
+def test_what_a_run_has_not_is_said(run, hub):
     (run.path / "hierarchy.gif").unlink()
     (run.path / "evaluation.json").unlink()
     (run.path / "policies/hop.onnx").write_bytes(b"a graph")
@@ -96,9 +91,7 @@ def test_what_a_run_has_not_is_said(run: sw.Run, hub: Hub) -> None:
     assert not [name for name in hub.files(NAME) if name.endswith((".onnx", ".gif", ".png"))]
 
 
-def test_a_later_run_takes_the_place_of_an_older_one_which_its_commit_still_has(
-    run: sw.Run, hub: Hub, tmp_path: Path
-) -> None:
+def test_a_later_run_takes_the_place_of_an_older_one_which_its_commit_still_has(run, hub, tmp_path):
     first = run.push(NAME)
     (run.path / "hierarchy.gif").rename(run.path / "film.mp4")
     other = declare(Right()).train(tmp_path / "other", quiet=True)
@@ -111,7 +104,7 @@ def test_a_later_run_takes_the_place_of_an_older_one_which_its_commit_still_has(
     assert same_actions(sw.from_hub(NAME, revision=first["commit"]), run)
 
 
-def test_a_hierarchy_that_needs_code_is_given_it(hub: Hub, tmp_path: Path) -> None:
+def test_a_hierarchy_that_needs_code_is_given_it(hub, tmp_path):
     hierarchy = declare(Careful())
     run = hierarchy.train(tmp_path / "run", quiet=True)
     run.push(NAME)
@@ -125,16 +118,14 @@ def test_a_hierarchy_that_needs_code_is_given_it(hub: Hub, tmp_path: Path) -> No
         sw.from_hub(NAME, declare(Left()))
 
 
-def test_a_plain_agent_is_shared_as_well(hub: Hub, tmp_path: Path) -> None:
+def test_a_plain_agent_is_shared_as_well(hub, tmp_path):
     env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
     run = sw.train_agent(env, SMALL, 100, tmp_path / "run", quiet=True)
     run.push(NAME)
     assert same_actions(sw.from_hub(NAME), run)
 
 
-def test_without_a_network_a_run_is_loaded_as_it_was_downloaded(
-    run: sw.Run, hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_network_a_run_is_loaded_as_it_was_downloaded(run, hub, tmp_path, monkeypatch):
     run.push(NAME)
     sw.from_hub(NAME)
     go_to(NOWHERE, tmp_path / "cache", monkeypatch)
@@ -148,16 +139,14 @@ def test_without_a_network_a_run_is_loaded_as_it_was_downloaded(
 
 
 @pytest.mark.parametrize("name", ["train.py", "policies/x.pkl", "model.bin", "a/../../b.json"])
-def test_a_file_that_is_not_data_is_refused_before_anything_is_downloaded(
-    name: str, run: sw.Run, hub: Hub
-) -> None:
+def test_a_file_that_is_not_data_is_refused_before_anything_is_downloaded(name, run, hub):
     hub.make(NAME, {**files_of(run.path), name: b"import os"})
     with pytest.raises(RunError, match=f"{NAME} holds '{name}'.*nothing of it is used"):
         sw.from_hub(NAME)
     assert [line for line in hub.asked if "/resolve/" in line] == []
 
 
-def test_files_of_the_hub_are_checked_like_those_of_any_run(run: sw.Run, hub: Hub) -> None:
+def test_files_of_the_hub_are_checked_like_those_of_any_run(run, hub):
     files = files_of(run.path)
     altered = files["run.json"].replace(b'"call_steps": 5', b'"call_steps": 6')
     hub.make(NAME, files | {"run.json": altered})
@@ -172,15 +161,13 @@ def test_files_of_the_hub_are_checked_like_those_of_any_run(run: sw.Run, hub: Hu
         sw.from_hub("ada/cut")
 
 
-def test_what_is_no_run_is_said(hub: Hub) -> None:
+def test_what_is_no_run_is_said(hub):
     hub.make(NAME, {"config.json": b"{}", "model.safetensors": b""})
     with pytest.raises(RunError, match="ada/cart holds no run of Skillweave"):
         sw.from_hub(NAME)
 
 
-def test_wrong_names_private_runs_and_revisions_are_told_with_what_to_do(
-    run: sw.Run, hub: Hub, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wrong_names_private_runs_and_revisions_are_told_with_what_to_do(run, hub, monkeypatch):
     hub.make("eve/secret", files_of(run.path), private=True)
     for token in ("good-token", ""):
         monkeypatch.setenv("HF_TOKEN", token)
@@ -198,9 +185,7 @@ def test_wrong_names_private_runs_and_revisions_are_told_with_what_to_do(
 # What is not pushed
 
 
-def test_an_unfinished_or_damaged_run_is_refused_before_the_hub_hears_of_it(
-    run: sw.Run, hub: Hub
-) -> None:
+def test_an_unfinished_or_damaged_run_is_refused_before_the_hub_hears_of_it(run, hub):
     path = run.path / "policies/left.safetensors"
     whole = path.read_bytes()
     path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
@@ -214,9 +199,7 @@ def test_an_unfinished_or_damaged_run_is_refused_before_the_hub_hears_of_it(
     assert hub.asked == []
 
 
-def test_who_may_not_write_is_told_what_to_do(
-    run: sw.Run, hub: Hub, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_may_not_write_is_told_what_to_do(run, hub, monkeypatch):
     for name in ("eve/new", "eve/old"):
         hub.make("eve/old", files_of(run.path))
         with pytest.raises(RunError, match=f"you may not write to {name}"):
@@ -226,7 +209,7 @@ def test_who_may_not_write_is_told_what_to_do(
         run.push(NAME)
 
 
-def test_what_is_something_else_or_public_is_left_alone(run: sw.Run, hub: Hub) -> None:
+def test_what_is_something_else_or_public_is_left_alone(run, hub):
     hub.make("ada/else", {"config.json": b"{}"})
     hub.make("ada/code", {**files_of(run.path), "train.py": b""})
     for name, why in (("ada/else", "other files"), ("ada/code", "'train.py'")):
@@ -241,7 +224,7 @@ def test_what_is_something_else_or_public_is_left_alone(run: sw.Run, hub: Hub) -
     assert hub.repos["ada/closed"].private
 
 
-def test_where_the_hub_fails_nothing_is_half_pushed(run: sw.Run, hub: Hub) -> None:
+def test_where_the_hub_fails_nothing_is_half_pushed(run, hub):
     for path, answer in (("/commit/", 500), ("/large/", 501), ("/large/", 403)):
         hub.breaks_at, hub.answer = path, answer
         why = "you may not write" if answer == 403 else f"the answer {answer}; try again later"
@@ -253,13 +236,13 @@ def test_where_the_hub_fails_nothing_is_half_pushed(run: sw.Run, hub: Hub) -> No
     assert same_actions(sw.from_hub(NAME), run)
 
 
-def test_no_network_is_told(run: sw.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_network_is_told(run, tmp_path, monkeypatch):
     go_to(NOWHERE, tmp_path / "cache", monkeypatch)
     with pytest.raises(RunError, match=r"cannot be reached\. Nothing was pushed"):
         run.push(NAME)
 
 
-def test_a_missing_library_names_its_extra(run: sw.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_names_its_extra(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     for share in (lambda: run.push(NAME), lambda: sw.from_hub(NAME)):
         with pytest.raises(MissingExtra, match=r"pip install 'skillweave\[hub\]'"):
@@ -269,9 +252,7 @@ def test_a_missing_library_names_its_extra(run: sw.Run, monkeypatch: pytest.Monk
 # On the command line
 
 
-def test_push_and_pull_on_the_command_line(
-    run: sw.Run, hub: Hub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_push_and_pull_on_the_command_line(run, hub, tmp_path, capsys):
     assert main(["push", str(run.path), NAME, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["url"] == f"{hub.url}/{NAME}"
     out = tmp_path / "pulled"

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
-from hub_server import Hub
 from shared_runs import NAME, files_of, same_actions
 
 import skillweave as sw
@@ -22,7 +19,7 @@ from skillweave.runs.directory import RunDirectory
 pytest.importorskip("huggingface_hub")
 
 
-def change(path: Path, **fields: Any) -> None:
+def change(path: Path, **fields):
     """Change fields of a run's ``run.json``, which stays whole."""
     directory = RunDirectory.open(path)
     directory.manifest = replace(directory.manifest, **fields)
@@ -34,9 +31,7 @@ def change(path: Path, **fields: Any) -> None:
 
 @pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("place", ["/home/ada/secret/", "C:\\ada\\secret\\", ""])
-def test_where_files_lie_and_who_tracks_a_run_does_not_go_up(
-    place: str, run: sw.Run, hub: Hub
-) -> None:
+def test_where_files_lie_and_who_tracks_a_run_does_not_go_up(place, run, hub):
     change(run.path, recipe=f"{place}still.py", track=("tensorboard",))
     here = files_of(run.path)
     run.push(NAME)
@@ -49,7 +44,7 @@ def test_where_files_lie_and_who_tracks_a_run_does_not_go_up(
     assert same_actions(sw.from_hub(NAME), run)  # its checksums hold
 
 
-def test_nor_does_where_a_ready_policy_lies(run: sw.Run, hub: Hub) -> None:
+def test_nor_does_where_a_ready_policy_lies(run, hub):
     left, right = run.info()["skills"]
     source = {"kind": "onnx", "file": "/home/ada/secret/hop.onnx", "sha256": "0" * 64}
     change(run.path, skills=[left | {"policy": source}, right])
@@ -64,20 +59,20 @@ def test_nor_does_where_a_ready_policy_lies(run: sw.Run, hub: Hub) -> None:
 
 
 @pytest.fixture
-def tracked(run: sw.Run, hub: Hub) -> None:
+def tracked(run, hub):
     """A run on the hub that names a tracker, as older versions pushed them."""
     change(run.path, track=("tensorboard",))
     hub.make(NAME, files_of(run.path))
 
 
-def test_a_run_that_is_pulled_names_no_tracker(tracked: None, tmp_path: Path) -> None:
+def test_a_run_that_is_pulled_names_no_tracker(tracked, tmp_path):
     path = sharing.pull_run(NAME, tmp_path / "pulled")
     assert main(["evaluate", str(path), "--episodes", "2"]) == 0
     assert not (path / "tensorboard").exists()
     assert RunDirectory.open(path).manifest.track == ()
 
 
-WRITES: dict[str, Callable[[sw.Run], object]] = {
+WRITES = {
     "evaluation": lambda run: run.evaluate(2, save=True),
     "film": lambda run: run.render(run.path / "film.gif"),
     "report": lambda run: run.report(episodes=1, films=0),
@@ -94,9 +89,7 @@ def contents(path: Path) -> dict[str, bytes]:
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("what", WRITES)
-def test_nothing_is_written_into_the_copy_that_the_hubs_library_keeps(
-    what: str, tracked: None, hub: Hub
-) -> None:
+def test_nothing_is_written_into_the_copy_that_the_hubs_library_keeps(what, tracked, hub):
     loaded = sw.from_hub(NAME)
     before = contents(loaded.path)
     with pytest.raises(SkillweaveError, match=f"skillweave pull {NAME}"):
@@ -105,9 +98,7 @@ def test_nothing_is_written_into_the_copy_that_the_hubs_library_keeps(
     assert list(hub.repos) == [NAME]
 
 
-def test_nor_by_a_command_that_is_given_its_folder(
-    tracked: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nor_by_a_command_that_is_given_its_folder(tracked, capsys):
     path = sw.from_hub(NAME).path
     before = contents(path)
     assert main(["evaluate", str(path), "--episodes", "2"]) == 0
@@ -115,9 +106,7 @@ def test_nor_by_a_command_that_is_given_its_folder(
     assert contents(path) == before
 
 
-def test_elsewhere_a_run_of_the_hub_writes_what_it_is_asked_to(
-    tracked: None, tmp_path: Path
-) -> None:
+def test_elsewhere_a_run_of_the_hub_writes_what_it_is_asked_to(tracked, tmp_path):
     pytest.importorskip("PIL")
     loaded = sw.from_hub(NAME)
     before = contents(loaded.path)

@@ -7,7 +7,6 @@ import json
 import pickle
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ WEIGHT = np.array([[-0.1, 0.1], [-0.2, 0.2], [-2.0, 2.0], [-1.0, 1.0]], np.float
 """Logits of CartPole's two actions: a controller that balances."""
 
 
-def linear(weight: Any = WEIGHT) -> torch.nn.Linear:
+def linear(weight=WEIGHT) -> torch.nn.Linear:
     weight = torch.tensor(np.asarray(weight, np.float32))
     module = torch.nn.Linear(*weight.shape, bias=False)
     with torch.no_grad():
@@ -26,7 +25,7 @@ def linear(weight: Any = WEIGHT) -> torch.nn.Linear:
 
 
 def onnx_file(
-    path: Path, weight: Any = WEIGHT, batch: Any = "n", whole: bool = False, apart: bool = False
+    path: Path, weight=WEIGHT, batch="n", whole: bool = False, apart: bool = False
 ) -> Path:
     """obs · weight as an ONNX file; ``whole``: returns the largest one; ``apart``: two files."""
     weight = np.asarray(weight, np.float32)
@@ -43,7 +42,7 @@ def onnx_file(
     )
 
 
-def sb3_zip(path: Path, name: str = "ppo", env: Any = "CartPole-v1", **settings: Any) -> Path:
+def sb3_zip(path: Path, name: str = "ppo", env="CartPole-v1", **settings) -> Path:
     import stable_baselines3
 
     policy = settings.pop("policy", "MlpPolicy")
@@ -55,10 +54,10 @@ def sb3_zip(path: Path, name: str = "ppo", env: Any = "CartPole-v1", **settings:
 class Evil:
     """Leaves a file behind when it is unpickled."""
 
-    def __init__(self, mark: Path) -> None:
+    def __init__(self, mark: Path):
         self.mark = mark
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self):
         return Path.touch, (self.mark,)
 
 

@@ -43,7 +43,7 @@ def observations(n: int, steps: int, seed: int = 0) -> list[Array]:
     return found
 
 
-def fit(policy: Any, space: Any = SPACE, action: Any = ACTION) -> Any:
+def fit(policy, space=SPACE, action=ACTION):
     """Return the policy, bound to the robot's spaces or others."""
     return fitted(policy, space, action, "skill 'walk'", "Robot-v0")
 
@@ -60,7 +60,7 @@ def one(obs: Array, i: int) -> dict[str, Any]:
 class Source:
     """A policy called by hand, in one environment: ``act(obs)`` of an observation as a dict."""
 
-    def act(self, obs: Any) -> Array:
+    def act(self, obs) -> Array:
         raise NotImplementedError
 
 
@@ -77,9 +77,7 @@ def weights(*shape: int) -> Array:
     return (np.random.default_rng(sum(shape)).normal(size=shape) * 0.3).astype(np.float32)
 
 
-def onnx_model(
-    path: Path, nodes: Any, inputs: Any, outputs: Any, constants: dict[str, Array], **how: Any
-) -> Path:
+def onnx_model(path: Path, nodes, inputs, outputs, constants: dict[str, Array], **how) -> Path:
     """Write an ONNX file: nodes (operation, inputs, outputs, perhaps attributes), shapes by name.
 
     Its numbers are real, those of ``ArgMax`` are whole; ``how``: as of ``onnx.save``.
@@ -87,7 +85,7 @@ def onnx_model(
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-    def values(shapes: dict[str, Any]) -> Any:
+    def values(shapes: dict[str, Any]):
         whole = [node[2][0] for node in nodes if node[0] == "ArgMax"]
         kinds = {k: TensorProto.INT64 if k in whole else TensorProto.FLOAT for k in shapes}
         return [helper.make_tensor_value_info(k, kinds[k], v) for k, v in shapes.items()]
@@ -135,10 +133,10 @@ def onnx_case(folder: Path) -> Case:
     )
 
     class Walk(Source):
-        def __init__(self) -> None:
+        def __init__(self):
             self.h = np.zeros(3, np.float32)
 
-        def act(self, obs: Any) -> Array:
+        def act(self, obs) -> Array:
             joints, grip = obs["arm"]["joints"], np.eye(3)[obs["arm"]["grip"]]
             x = np.concatenate([obs["gyro"] * 0.25, joints - HOME, grip])
             self.h = np.tanh(x @ w + np.array([2.0, -0.25]) @ u + self.h @ h)
@@ -154,7 +152,7 @@ def onnx_case(folder: Path) -> Case:
 class Script(torch.nn.Module):
     """Two inputs' worth of numbers in one."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.w = torch.nn.Parameter(torch.from_numpy(weights(50, 5)))
 
@@ -173,10 +171,10 @@ def script_case(folder: Path) -> Case:
     )
 
     class ByHand(Source):
-        def __init__(self) -> None:
+        def __init__(self):
             self.t, self.last = 0, np.zeros(5)
 
-        def act(self, obs: Any) -> Array:
+        def act(self, obs) -> Array:
             if self.t % 3 == 0:
                 x = np.concatenate([obs["state"][3:], np.clip(2 * self.last, -0.5, 0.5)])
                 self.last = (x @ weights(50, 5)) * 0.3
@@ -198,7 +196,7 @@ def sb3_case(folder: Path) -> Case:
         observation_space = Box(-10, 10, (4,), np.float32)
         action_space = Box(-1, 1, (5,), np.float32)
 
-        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        def reset(self, *, seed=None, options=None):
             return np.zeros(4, np.float32), {}
 
     env = VecNormalize(DummyVecEnv([Small]), clip_obs=1.5)
@@ -216,7 +214,7 @@ def sb3_case(folder: Path) -> Case:
     )
 
     class ByHand(Source):
-        def act(self, obs: Any) -> Array:
+        def act(self, obs) -> Array:
             x = np.concatenate([obs["state"][[7, 2]], 3.0 * obs["gyro"][:2]])
             return model.predict(env.normalize_obs(x), deterministic=True)[0][[1, 0, 2, 4, 3]]
 
@@ -229,12 +227,12 @@ def sb3_case(folder: Path) -> Case:
 class Recurrent(torch.nn.Module):
     """An LSTM with a head."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         torch.manual_seed(3)
         self.lstm, self.head = torch.nn.LSTM(8, 6, num_layers=2), torch.nn.Linear(6, 5)
 
-    def forward(self, x: torch.Tensor, state: Any) -> Any:
+    def forward(self, x: torch.Tensor, state):
         y, state = self.lstm(x[None], state)
         return self.head(y[0]) * 4.0, state
 
@@ -244,10 +242,10 @@ def recurrent_case(folder: Path) -> Case:
     policy = sw.from_torch(module, sees=("gyro", "arm.joints"), state=[(2, None, 6), (2, None, 6)])
 
     class ByHand(Source):
-        def __init__(self) -> None:
+        def __init__(self):
             self.state = torch.zeros(2, 1, 6), torch.zeros(2, 1, 6)
 
-        def act(self, obs: Any) -> Array:
+        def act(self, obs) -> Array:
             x = np.concatenate([obs["gyro"], obs["arm"]["joints"]]).astype(np.float32)
             with torch.no_grad():
                 y, self.state = module(torch.from_numpy(x)[None], self.state)
@@ -278,10 +276,10 @@ def function_case(folder: Path) -> Case:
     )
 
     class ByHand(Source):
-        def __init__(self) -> None:
+        def __init__(self):
             self.t = 0
 
-        def act(self, obs: Any) -> Array:
+        def act(self, obs) -> Array:
             if self.t % 2 == 0:
                 command = np.clip(-obs["gyro"], -1, 1) * 0.5
                 x = np.concatenate([command, [np.linalg.norm(obs["state"])]])
@@ -298,7 +296,7 @@ def function_case(folder: Path) -> Case:
 class Chunked(torch.nn.Module):
     """Six actions from one observation."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         torch.manual_seed(5)
         self.layer = torch.nn.Linear(9, 6 * 2)
@@ -318,10 +316,10 @@ def chunked_case(folder: Path) -> Case:
     )
 
     class ByHand(Source):
-        def __init__(self) -> None:
+        def __init__(self):
             self.t = 0
 
-        def act(self, obs: Any) -> Array:
+        def act(self, obs) -> Array:
             if self.t % 8 == 0:
                 x = np.concatenate([obs["state"][::8], obs["gyro"]])
                 with torch.no_grad():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ def step(n: int = 4) -> Step:
 class Counts(Skill):
     calls = 0
 
-    def reward(self, step: Any) -> Any:
+    def reward(self, step):
         self.calls += 1
         return step.reward * self.calls
 
@@ -33,7 +32,7 @@ class Progress(Skill):
 
     best = -np.inf
 
-    def reward(self, step: Any) -> Any:
+    def reward(self, step):
         gain = np.maximum(step.next_obs[:, 0] - max(self.best, -1.0), 0.0)
         self.best = max(self.best, float(step.next_obs.max()))
         return gain
@@ -42,11 +41,11 @@ class Progress(Skill):
 class Patient(Skill):
     """Stops at the second time."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
-        self.seen: list[int] = []
+        self.seen = []
 
-    def termination(self, step: Any) -> Any:
+    def termination(self, step):
         self.seen.append(len(step.reward))
         return np.full(len(step.reward), len(self.seen) > 1)
 
@@ -54,7 +53,7 @@ class Patient(Skill):
 class Shy(Skill):
     waits = 3
 
-    def initiation(self, obs: Any) -> Any:
+    def initiation(self, obs):
         self.waits -= 1
         return np.full(len(obs), self.waits < 2)
 
@@ -68,7 +67,7 @@ class Shy(Skill):
         (Shy, "initiation"),
     ],
 )
-def test_a_skill_that_answers_otherwise_when_asked_twice_is_named(kind: Any, method: str) -> None:
+def test_a_skill_that_answers_otherwise_when_asked_twice_is_named(kind, method):
     about = step().obs if method == "initiation" else step()
     message = rf"skill '{kind.name}': {method}\(\) answers .* keeps a state of its own.*info"
     with pytest.raises(SkillError, match=message):
@@ -78,12 +77,12 @@ def test_a_skill_that_answers_otherwise_when_asked_twice_is_named(kind: Any, met
 class Noisy(Skill):
     """Pays random numbers, of every kind of generator."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.numbers = np.random.default_rng(0)
         self.python = random.Random(0)
 
-    def reward(self, step: Any) -> Any:
+    def reward(self, step):
         n = len(step.reward)
         return (
             self.numbers.random(n)
@@ -93,7 +92,7 @@ class Noisy(Skill):
         )
 
 
-def test_random_rewards_are_no_state() -> None:
+def test_random_rewards_are_no_state():
     skill, twin = Noisy(), Noisy()
     np.random.seed(1)  # noqa: NPY002
     random.seed(1)
@@ -106,10 +105,10 @@ def test_random_rewards_are_no_state() -> None:
     assert len(asked(skill, "reward", step())) == 4
 
 
-def test_a_reflex_that_keeps_a_state_is_named() -> None:
-    seen: list[int] = []
+def test_a_reflex_that_keeps_a_state_is_named():
+    seen = []
 
-    def second_time(obs: Any) -> Any:
+    def second_time(obs):
         seen.append(1)
         return np.full(len(obs), len(seen) > 1)
 
@@ -117,12 +116,12 @@ def test_a_reflex_that_keeps_a_state_is_named() -> None:
         Reflex(second_time, 0).holds(step().obs)
 
 
-def test_a_reward_that_is_meant_to_change_says_so() -> None:
+def test_a_reward_that_is_meant_to_change_says_so():
     class Bonus(Counts):
         reward_changes = True
 
     class Wrong(Counts):
-        reward_changes: Any = "yes"
+        reward_changes = "yes"
 
     assert asked(Bonus(), "reward", step()).tolist() == [1] * 4
     with pytest.raises(DeclarationError, match="reward_changes is 'yes'; it must be True or False"):

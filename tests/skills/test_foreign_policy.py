@@ -425,7 +425,7 @@ def test_sources_say_where_policies_come_from(zip_file, tmp_path):
     assert [len(s.sha256 or "") for s in (*found, zipped)] == [0, 64, 64, 64]
 
 
-def test_a_copy_that_is_damaged_missing_or_of_another_shape_is_said():
+def test_a_copy_that_is_damaged_or_missing_is_said():
     then, now = fit(from_torch(linear())), fit(from_torch(linear(2 * WEIGHT)))
 
     def load(policy, content):
@@ -437,21 +437,8 @@ def test_a_copy_that_is_damaged_missing_or_of_another_shape_is_said():
         load(now, b"junk")
     with pytest.raises(SkillweaveError, match=r"runs/x.*torch .*Linear.*another checksum"):
         load(now, None)
-    with pytest.raises(SkillweaveError, match=r"module Linear.*do not fit"):
-        load(from_torch(torch.nn.Linear(4, 3)), then.content())
-    with pytest.raises(SkillweaveError, match=r"kind torch .*Linear.*now it is function .*lean"):
-        load(from_function(lean), then.content())
 
 
 def test_a_policy_that_fails_is_named_before_it_is_scored():
     with pytest.raises(PolicyError, match="the policy: module Linear fails on observations"):
         evaluate(from_torch(torch.nn.Linear(3, 2)), "CartPole-v1", episodes=1)
-
-
-@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
-def test_a_model_that_has_just_been_trained(env):
-    sb3 = pytest.importorskip("stable_baselines3")
-    model = sb3.A2C("MlpPolicy", env, n_steps=8, device="cpu")
-    model.learn(8)
-    policy = from_sb3(model)
-    assert len(evaluate(policy, env, episodes=1, max_steps=5).returns) == 1

@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from small_runs import interrupted
 
 import skillweave as sw
 from skillweave._internal.seeding import Seeds
@@ -213,12 +214,8 @@ def test_resumed_it_ends_with_the_same_weights(tmp_path):
 
     whole = declared().train(tmp_path / "whole", quiet=True)
 
-    def stop(event):
-        if event.steps >= 32:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        declared().train(tmp_path / "cut", quiet=True, callback=stop, checkpoint_every=16)
+    with interrupted(2):
+        declared().train(tmp_path / "cut", quiet=True, checkpoint_every=16)
     cut = declared().train(tmp_path / "cut", resume=True, quiet=True)
     for ours, theirs in zip(whole.policy.skills.policies, cut.policy.skills.policies, strict=True):
         for name, value in ours.weights.items():

@@ -9,7 +9,7 @@ from skills.mapped_models import CASES, Case, fit, observations, one
 
 
 @pytest.fixture(scope="module")
-def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
+def cases(tmp_path_factory) -> dict[str, Case]:
     pytest.importorskip("onnxruntime")
     pytest.importorskip("stable_baselines3")
     folder = tmp_path_factory.mktemp("mapped")
@@ -17,12 +17,10 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_acts_as_its_source_wherever_others_act_or_start_again(
-    cases: dict[str, Case], name: str
-) -> None:
+def test_it_acts_as_its_source_wherever_others_act_or_start_again(cases, name):
     case, n = cases[name], 5
     policy, sources = fit(case.policy), [case.source() for _ in range(n)]
-    memory, rng, acted = policy.start(n), np.random.default_rng(1), set[float]()
+    memory, rng, acted = policy.start(n), np.random.default_rng(1), set()
     for obs in observations(n, 30, seed=1):
         fresh = np.flatnonzero(rng.random(n) < 0.2)
         for k, v in policy.start(len(fresh)).items():
@@ -45,7 +43,7 @@ def test_it_acts_as_its_source_wherever_others_act_or_start_again(
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_acts_the_same_in_another_process(cases: dict[str, Case], name: str) -> None:
+def test_it_acts_the_same_in_another_process(cases, name):
     policy = fit(cases[name].policy)
     sent = cloudpickle.loads(cloudpickle.dumps(policy))
     memory, memories = policy.start(3), sent.start(3)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +31,7 @@ def choice(n: int) -> Space:
     return Space("Discrete", "int64", (), np.array(0), np.array(n - 1))
 
 
-def zeros(x: Array, *more: Any) -> Array:
+def zeros(x: Array, *more) -> Array:
     return np.zeros((len(x), 2), np.float32)
 
 
@@ -86,12 +84,12 @@ BOTH = Space("Dict", parts={"a": box(2), "b": choice(2)})
         ),
     ],
 )
-def test_what_contradicts_itself_is_refused(make: Any, says: str) -> None:
+def test_what_contradicts_itself_is_refused(make, says):
     with pytest.raises(PolicyError, match=says):
         make()
 
 
-def test_what_does_not_fit_the_spaces_is_refused() -> None:
+def test_what_does_not_fit_the_spaces_is_refused():
     made = Mapped(FUNCTION, Outputs(box(2)), {"": Input((SEEN,), (3,))})
     made.check(box(3), box(2), None, "policy")
     for sees, acts, says in (
@@ -107,15 +105,15 @@ def test_what_does_not_fit_the_spaces_is_refused() -> None:
 
 
 @pytest.fixture
-def content(tmp_path: Path) -> bytes:
+def content(tmp_path) -> bytes:
     pytest.importorskip("onnxruntime")
     nodes = [("MatMul", ["obs", "w"], ["s"]), ("Add", ["s", "h"], ["after"])]
-    shapes: Any = {"obs": ["n", 3], "h": ["n", 2]}, {"after": ["n", 2], "s": ["n", 2]}
+    shapes = {"obs": ["n", 3], "h": ["n", 2]}, {"after": ["n", 2], "s": ["n", 2]}
     return onnx_model(tmp_path / "x.onnx", nodes, *shapes, {"w": weights(3, 2)}).read_bytes()
 
 
-def test_an_onnx_file_that_its_fields_do_not_fit_is_refused(content: bytes) -> None:
-    right: Any = {"output": "after", "inputs": ("obs",), "state": (("h", "after"),)}
+def test_an_onnx_file_that_its_fields_do_not_fit_is_refused(content):
+    right = {"output": "after", "inputs": ("obs",), "state": (("h", "after"),)}
     file = OnnxFile(content, **right)
     assert (file.expected, file.states) == ({"obs": (3,)}, [((2,), np.float32)])
     for change, says in (
@@ -163,11 +161,11 @@ def recurrent(chunk: int | None) -> Mapped:
 
 @pytest.mark.parametrize("chunk", [None, 3])
 @pytest.mark.parametrize("aims", [False, True])
-def test_some_rows_act_as_each_does_alone(chunk: int | None, aims: bool) -> None:
+def test_some_rows_act_as_each_does_alone(chunk, aims):
     rng, n, policy = np.random.default_rng(0), 5, recurrent(chunk)
     together, alone = policy.start(n), [policy.start(1) for _ in range(n)]
     assert set(together) == {"state.0", "last", "phase", "held"}
-    actions = set[float]()
+    actions = set()
     for _ in range(40):
         rows = np.flatnonzero(rng.random(n) < 0.6)
         obs = rng.normal(size=(len(rows), 3)).astype(np.float32)
@@ -182,12 +180,12 @@ def test_some_rows_act_as_each_does_alone(chunk: int | None, aims: bool) -> None
     assert len(actions) > 20
 
 
-def _same(together: Memory, alone: list[Memory]) -> None:
+def _same(together: Memory, alone: list[Memory]):
     for name, values in together.items():
         np.testing.assert_array_equal(values, np.concatenate([one[name] for one in alone]))
 
 
-def test_records_are_held_as_records() -> None:
+def test_records_are_held_as_records():
     def both(obs: Array) -> dict[str, Array]:
         return {"a": obs[:, :2], "b": (obs[:, 2] > 0).astype(int)}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from skillweave.spaces import obs_codec, obs_dtype, to_tensor
 from skillweave.types import Array
 
 
-def seen(sees: Any, space: Any = SPACE, obs: Any = None, **more: Any) -> Array:
+def seen(sees, space=SPACE, obs=None, **more) -> Array:
     """The input that a policy with this ``sees`` gets."""
     found = []
 
@@ -38,13 +37,13 @@ def seen(sees: Any, space: Any = SPACE, obs: Any = None, **more: Any) -> Array:
 # What a policy sees
 
 
-def test_one_word_is_enough_for_a_part_and_for_a_list_of_keys() -> None:
+def test_one_word_is_enough_for_a_part_and_for_a_list_of_keys():
     obs = observations(2, 1)[0]
     np.testing.assert_array_equal(seen("state"), obs["state"])
     np.testing.assert_array_equal(seen(("state", "gyro"))[:, 48:], obs["gyro"])
 
 
-def test_places_count_as_those_of_a_network_do() -> None:
+def test_places_count_as_those_of_a_network_do():
     obs = observations(2, 1)[0]
     flat = obs_codec(SPACE).split(to_tensor(obs))[0].numpy()  # as networks see it
     np.testing.assert_allclose(seen((11, 0, 8, 9, 58)), flat[:, [11, 0, 8, 9, 58]])
@@ -57,7 +56,7 @@ def test_places_count_as_those_of_a_network_do() -> None:
     np.testing.assert_allclose(seen((scaled, 0))[:, :9], (flat[:, 2:11] - pairs) * pairs, rtol=1e-5)
 
 
-def test_a_choice_may_stay_a_number_and_a_tuple_has_its_places_as_keys() -> None:
+def test_a_choice_may_stay_a_number_and_a_tuple_has_its_places_as_keys():
     obs = observations(2, 1)[0]
     grip = seen((sw.Part("arm.grip", one_hot=False), "gyro"))[:, 0]
     np.testing.assert_array_equal(grip, obs["arm"]["grip"])
@@ -66,7 +65,7 @@ def test_a_choice_may_stay_a_number_and_a_tuple_has_its_places_as_keys() -> None
     assert seen("a", pair, packed).tolist() == [[0, 1, 0, 1, 0], [1, 0, 0, 0, 1]]
 
 
-def test_an_image_alone_keeps_its_shape() -> None:
+def test_an_image_alone_keeps_its_shape():
     space = Dict({"camera": Box(0, 255, (20, 20, 3), np.uint8), "speed": Box(-1, 1, (2,))})
     obs = np.zeros(2, [("camera", np.uint8, (20, 20, 3)), ("speed", np.float32, (2,))])
     obs["camera"][:] = np.random.default_rng(0).integers(0, 255, (2, 20, 20, 3))
@@ -79,7 +78,7 @@ def test_an_image_alone_keeps_its_shape() -> None:
         sw.from_function(zeros, sees="eyes").bind(films, ACTION, "it")
 
 
-def test_a_goal_that_is_given_to_act_replaces_the_fixed_one() -> None:
+def test_a_goal_that_is_given_to_act_replaces_the_fixed_one():
     found = []
 
     def look(x: Array) -> Array:
@@ -93,7 +92,7 @@ def test_a_goal_that_is_given_to_act_replaces_the_fixed_one() -> None:
     assert found[-2:] == [[[2, 4], [2, 4]], [[6, 8], [10, 12]]]
 
 
-def test_goals_and_computed_numbers_keep_their_number() -> None:
+def test_goals_and_computed_numbers_keep_their_number():
     widths = iter([2, 2, 2, 2, 3])
 
     def grows(obs: Array) -> Array:
@@ -111,10 +110,10 @@ def test_goals_and_computed_numbers_keep_their_number() -> None:
         fit(sw.from_function(lambda x: zeros(x) * np.nan, acts=sw.Acts(clip=(-1, 1))))
 
 
-def test_what_is_remembered_is_no_array_of_the_users() -> None:
+def test_what_is_remembered_is_no_array_of_the_users():
     kept, out = np.zeros((2, 1)), np.zeros((2, 5))
 
-    def counts(x: Array, state: Array) -> Any:
+    def counts(x: Array, state: Array):
         kept[:] = state + 1  # the same arrays at each call
         out[:] = kept / 100 + x[:, 3:] / 10
         return out, kept
@@ -128,7 +127,7 @@ def test_what_is_remembered_is_no_array_of_the_users() -> None:
     assert second["state.0"].tolist() == [[2], [2]]
     assert first["last"].max() < second["last"].max()
 
-    def changes(x: Array, state: Array) -> Any:
+    def changes(x: Array, state: Array):
         state += 1
         return zeros(x), state
 
@@ -136,7 +135,7 @@ def test_what_is_remembered_is_no_array_of_the_users() -> None:
         fit(sw.from_function(changes, state=(None, 1)))
 
 
-def test_a_module_that_takes_the_goal_of_its_skill_is_copied_too() -> None:
+def test_a_module_that_takes_the_goal_of_its_skill_is_copied_too():
     module = torch.nn.Linear(5, 5)
     skill = type("Go", (sw.Skill,), {"goal_space": Box(-1, 1, (2,))})()
     policy = sw.from_torch(module, sees=("gyro", sw.Goal()))
@@ -148,7 +147,7 @@ def test_a_module_that_takes_the_goal_of_its_skill_is_copied_too() -> None:
     np.testing.assert_array_equal(bound.act(bound.start(2), obs)[0], before)
 
 
-def test_choices_of_a_policy_may_have_other_numbers_in_the_environment() -> None:
+def test_choices_of_a_policy_may_have_other_numbers_in_the_environment():
     space = Box(-1, 1, (3,), np.float32)
     net = torch.nn.Identity()
     actions = Discrete(5, start=10)
@@ -161,9 +160,9 @@ def test_choices_of_a_policy_may_have_other_numbers_in_the_environment() -> None
     assert policy.act({}, obs, mask)[0].tolist() == [12, 10, 12]
 
 
-def test_a_program_of_torch_export_acts_with_a_batch_or_without(tmp_path: Any) -> None:
+def test_a_program_of_torch_export_acts_with_a_batch_or_without(tmp_path):
     class Two(torch.nn.Module):
-        def __init__(self) -> None:
+        def __init__(self):
             super().__init__()
             self.w = torch.nn.Parameter(torch.from_numpy(weights(3, 5)))
 
@@ -192,7 +191,7 @@ def test_a_program_of_torch_export_acts_with_a_batch_or_without(tmp_path: Any) -
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"trust": 1}])
-def test_files_that_can_run_code_are_not_opened_without_trust(kwargs: Any, tmp_path: Any) -> None:
+def test_files_that_can_run_code_are_not_opened_without_trust(kwargs, tmp_path):
     with pytest.raises(PolicyError, match=r"x.pt was not opened.*trust=True"):
         sw.from_torch(tmp_path / "x.pt", **kwargs)
     pytest.importorskip("stable_baselines3")
@@ -200,7 +199,7 @@ def test_files_that_can_run_code_are_not_opened_without_trust(kwargs: Any, tmp_p
         sw.from_sb3(a_model(), normalize=tmp_path / "normal.pkl", **kwargs)
 
 
-def test_statistics_of_another_model_are_refused(tmp_path: Any) -> None:
+def test_statistics_of_another_model_are_refused(tmp_path):
     pytest.importorskip("stable_baselines3")
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.vec_env import VecNormalize
@@ -219,9 +218,7 @@ def test_statistics_of_another_model_are_refused(tmp_path: Any) -> None:
         sw.from_sb3(a_model(), normalize=other)
 
 
-def test_statistics_that_a_model_has_are_used_and_a_file_beside_its_zip_is_named(
-    tmp_path: Any, recwarn: Any
-) -> None:
+def test_statistics_that_a_model_has_are_used_and_a_file_beside_its_zip_is_named(tmp_path, recwarn):
     pytest.importorskip("stable_baselines3")
     import stable_baselines3 as sb3
     from stable_baselines3.common.env_util import make_vec_env
@@ -246,13 +243,13 @@ def test_statistics_that_a_model_has_are_used_and_a_file_beside_its_zip_is_named
         assert sum("my_VecNormalize.pkl" in str(each.message) for each in recwarn) == notices
 
 
-def a_model() -> Any:
+def a_model():
     import stable_baselines3 as sb3
 
     return sb3.A2C("MlpPolicy", "CartPole-v1", device="cpu")
 
 
-def test_weights_alone_are_no_module(tmp_path: Any) -> None:
+def test_weights_alone_are_no_module(tmp_path):
     for name, content in (("s.pt", torch.nn.Linear(2, 2).state_dict()), ("m.pt", torch.nn.ReLU())):
         torch.save(content, tmp_path / name)
         with pytest.raises(PolicyError, match=rf"{name} holds neither.*from_torch\(module\)"):
@@ -291,7 +288,7 @@ def zeros(x: Array) -> Array:
         ({"acts": (0, 0)}, "each place of an action can be written once"),
     ],
 )
-def test_arguments_that_no_environment_could_fit(arguments: Any, message: str) -> None:
+def test_arguments_that_no_environment_could_fit(arguments, message):
     with pytest.raises(DeclarationError, match=message):
         sw.from_function(zeros, **arguments)
 
@@ -307,7 +304,7 @@ def test_arguments_that_no_environment_could_fit(arguments: Any, message: str) -
         (lambda: sw.LastAction(scale=[]), "LastAction.scale"),
     ],
 )
-def test_settings_that_are_wrong_are_named(make: Any, message: str) -> None:
+def test_settings_that_are_wrong_are_named(make, message):
     with pytest.raises(DeclarationError, match=message):
         make()
 
@@ -337,10 +334,8 @@ def test_settings_that_are_wrong_are_named(make: Any, message: str) -> None:
         ({"state": (None, 3)}, "returned a ndarray; with a state it must return two values"),
     ],
 )
-def test_what_does_not_fit_the_environment_names_skill_and_field(
-    arguments: Any, message: str
-) -> None:
-    def act(x: Array, *state: Any) -> Array:
+def test_what_does_not_fit_the_environment_names_skill_and_field(arguments, message):
+    def act(x: Array, *state) -> Array:
         return np.zeros((len(x), 5))
 
     if "acts" in arguments and arguments["acts"].to == (0, 1) and arguments["acts"].rest == (1, 2):
@@ -349,7 +344,7 @@ def test_what_does_not_fit_the_environment_names_skill_and_field(
         fit(sw.from_function(act, **arguments))
 
 
-def test_mappings_that_actions_of_a_kind_do_not_have() -> None:
+def test_mappings_that_actions_of_a_kind_do_not_have():
     def choose(x: Array) -> Array:
         return np.zeros(len(x), int)
 
@@ -369,7 +364,7 @@ def test_mappings_that_actions_of_a_kind_do_not_have() -> None:
         fit(sw.from_function(choose, sees="gyro"), Box(-1, 1, (3,)), Discrete(2))
 
 
-def test_inputs_that_stay_unset_are_named(tmp_path: Any) -> None:
+def test_inputs_that_stay_unset_are_named(tmp_path):
     pytest.importorskip("onnxruntime")
     one = onnx_model(
         tmp_path / "one.onnx",
@@ -415,7 +410,7 @@ def ramp(obs: Array) -> Array:
     return obs["gyro"] * 2
 
 
-def test_a_mapping_is_read_back_from_json() -> None:
+def test_a_mapping_is_read_back_from_json():
     mapping = sw.from_function(
         zeros,
         sees={
@@ -435,7 +430,7 @@ def test_a_mapping_is_read_back_from_json() -> None:
         PolicyMapping.from_json(data)
 
 
-def test_functions_of_one_name_are_told_apart() -> None:
+def test_functions_of_one_name_are_told_apart():
     one, two = (lambda obs, k=k: obs["gyro"] * k for k in (1.0, 2.0))
     mapping = sw.from_function(zeros, sees=(one, two, one, sw.Goal()), goal=two).mapping
     assert len(mapping.functions()) == 2
@@ -455,12 +450,12 @@ def test_functions_of_one_name_are_told_apart() -> None:
         ("goal", [None], "goal is "),
     ],
 )
-def test_fields_of_a_file_are_checked(field: str, value: Any, message: str) -> None:
+def test_fields_of_a_file_are_checked(field, value, message):
     with pytest.raises(DeclarationError, match=message):
         PolicyMapping.from_json({field: value})
 
 
-def test_what_a_run_has_recorded_is_what_acts_whatever_the_recipe_maps_now() -> None:
+def test_what_a_run_has_recorded_is_what_acts_whatever_the_recipe_maps_now():
     module = torch.nn.Linear(3, 5)
     then = fit(sw.from_torch(module, sees=sw.Part("gyro", scale=2.0)))
     now = fit(sw.from_torch(module, sees=sw.Part("gyro", scale=3.0), every=2))
@@ -468,7 +463,7 @@ def test_what_a_run_has_recorded_is_what_acts_whatever_the_recipe_maps_now() -> 
     assert recorded.mapping is not None
     assert recorded.mapping["sees"][""][0]["scale"] == 2.0
     obs = observations(3, 1)[0]
-    restored: Any = as_recorded(now, recorded, lambda: None, "runs/x: skill 'walk'")
+    restored = as_recorded(now, recorded, lambda: None, "runs/x: skill 'walk'")
     np.testing.assert_array_equal(
         restored.act(restored.start(3), obs)[0], then.act(then.start(3), obs)[0]
     )

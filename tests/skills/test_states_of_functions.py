@@ -36,60 +36,60 @@ class Best:
 
     best = 0.0
 
-    def __call__(self, about: Any) -> Any:
+    def __call__(self, about):
         obs = getattr(about, "next_obs", about)
         self.best = max(self.best, float(obs.max()))
         return np.full(len(obs), int(self.best > 1))
 
 
 class Two(Best):
-    def __call__(self, about: Any, other: Any) -> Any:  # type: ignore[override]
+    def __call__(self, about, other):
         return super().__call__(about)
 
 
 class Goal(Best):
-    def __call__(self, obs: Any, other: Any) -> Any:  # type: ignore[override]
+    def __call__(self, obs, other):
         return super().__call__(obs)[:, None]
 
 
 class OfObservations(Best):
-    def __call__(self, obs: Any) -> Any:
+    def __call__(self, obs):
         return super().__call__(obs)[:, None]
 
 
 class Own(Memoryless):
     observation_space, action_space = SPACES
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.inner = Best()
 
-    def act(self, memory: Any, obs: Any) -> Any:
+    def act(self, memory, obs):
         return self.inner(obs), memory
 
 
-def acts(**how: Any) -> Any:
+def acts(**how):
     policy = from_function(Best(), **how).bind(*SPACES, "it")
     policy.try_out()
     return lambda: policy.act({}, OBS)
 
 
-def reads(function: Any) -> Any:
+def reads(function):
     policy = from_function(lambda x: np.zeros(len(x), int), sees=function).bind(*SPACES, "it")
     return lambda: policy.act({}, OBS)
 
 
-def chooses(value: Any) -> Any:
+def chooses(value):
     selector = ready_selector(value, ("a", "b"))
     assert selector is not None
     memory, last = selector.start(4), LastCall(*np.zeros((3, 4), int))
     return lambda: (selector.act(memory, OBS), selector.watch(memory, step(), last))
 
 
-def method(name: str) -> Any:
+def method(name: str):
     base = Goal if name in Skill.of_goals else Best
     declared = {name: base.__call__, "goal_space": Box(0, 9, (1,))}
     goals = Goals(type("Kind", (base, Skill), declared)())
-    about: Any = OBS if name == "initiation" else step()
+    about = OBS if name == "initiation" else step()
     ways = {
         "goals": lambda: goals.draw(OBS, np.random.default_rng(0)),
         "clip_goal": lambda: goals.fitted(OBS, OBS, "it"),
@@ -130,7 +130,7 @@ def places() -> dict[str, list[Callable[[], Any]]]:
 
 
 @pytest.mark.parametrize("place", sorted(places()))
-def test_each_function_that_keeps_a_state_gets_one_notice(place: str) -> None:
+def test_each_function_that_keeps_a_state_gets_one_notice(place):
     for act in places()[place]:
         with collected_notices() as notices:
             for _ in range(4):
@@ -138,7 +138,7 @@ def test_each_function_that_keeps_a_state_gets_one_notice(place: str) -> None:
         assert len(notices.take()) == 1
 
 
-def test_every_module_that_calls_functions_of_the_user_is_tested() -> None:
+def test_every_module_that_calls_functions_of_the_user_is_tested():
     others = ("outputs", "probing")  # of all, or before them
     calls = {
         name.removeprefix("skillweave.")
@@ -153,18 +153,18 @@ def test_every_module_that_calls_functions_of_the_user_is_tested() -> None:
 class Fine:
     """Writes what is written once, or what no answer depends on."""
 
-    table: Any = None
+    table = None
     calls = 0
 
-    def __init__(self) -> None:
-        self.known: dict[float, float] = {}
+    def __init__(self):
+        self.known = {}
         self.buffer, self.rng, self.python = np.zeros(0), np.random.default_rng(0), random.Random(0)
 
     @cached_property
     def scale(self) -> float:
         return 2.0
 
-    def __call__(self, obs: Any) -> Any:
+    def __call__(self, obs):
         self.calls += 1
         self.table = np.arange(3.0) if self.table is None else self.table
         self.buffer = self.buffer if len(self.buffer) == len(obs) else np.ones(len(obs))
@@ -173,7 +173,7 @@ class Fine:
         return self.last + values + self.table[1] + self.buffer
 
 
-def test_caches_generators_and_unread_attributes_are_no_state() -> None:
+def test_caches_generators_and_unread_attributes_are_no_state():
     fine = Fine()
     for _ in range(4):  # a notice would be an error here
         called(fine, OBS, "it")
@@ -181,13 +181,13 @@ def test_caches_generators_and_unread_attributes_are_no_state() -> None:
 
 
 class Shaped:
-    last: Any = None
+    last = None
 
-    def __call__(self, obs: Any) -> Any:
+    def __call__(self, obs):
         self.last = obs[:, 0] if self.last is None else self.last + obs[:, 0]
         return (self.last > 1).astype(int)
 
 
-def test_a_state_of_the_shape_of_the_first_call_is_named() -> None:
+def test_a_state_of_the_shape_of_the_first_call_is_named():
     with pytest.raises(PolicyError, match=r"for 3 it raised .* last, .*state="):
         from_function(Shaped()).bind(*SPACES, "it").try_out()

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
 from skillweave.envs import engine as engines
 
 
 @pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def made(monkeypatch) -> list[int]:
     """Counts the steps that Gymnasium's engines make."""
     count, plain = [0], engines.GymnasiumEngine.step
 
-    def step(self: Any, action: Any, ids: Any = None) -> Any:
+    def step(self, action, ids=None):
         count[0] += len(action)
         return plain(self, action, ids)
 

@@ -1,20 +1,15 @@
 """A stage learns on the device that its settings name."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
 from skillweave import DQN, PPO, SAC, Network, SkillweaveError, train_agent
 from skillweave.evolution import Evolution
-from skillweave.runs.files import read_tensors
 
 NET = Network((8,))
-REPLAY: dict[str, Any] = {
+REPLAY = {
     "num_envs": 4, "learning_starts": 40, "batch_size": 8, "update_ratio": 0.1, "network": NET,
     "normalize_obs": True, "normalize_rewards": True,
 }  # fmt: skip
@@ -28,48 +23,42 @@ EVOLVE = [None, Evolution(population=2, generations=2, episodes=1)]
 gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 
 
-@pytest.mark.parametrize("name", LEARNERS)
-@pytest.mark.parametrize("evolve", EVOLVE)
-def test_a_device_that_is_not_there_is_told_before_anything_is_written(
-    name: str, evolve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+def train(name, evolve, device, path, steps=256):
     config, env = LEARNERS[name]
-    config = replace(config, device="cuda")
+    how = {"quiet": True, "evolve": evolve, "checkpoint_every": 200}
+    return train_agent(env, replace(config, device=device), steps, path, **how)
+
+
+each_learner = pytest.mark.parametrize("name", LEARNERS)
+with_or_without = pytest.mark.parametrize("evolve", EVOLVE)
+
+
+@each_learner
+@with_or_without
+def test_a_device_that_is_not_there_is_told_before_anything_is_written(
+    name, evolve, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(SkillweaveError, match=r"stage 'agent': .*no CUDA device here; use 'cpu'"):
-        train_agent(
-            env, config, 256, tmp_path / "run", quiet=True, evolve=evolve, checkpoint_every=200
-        )
+        train(name, evolve, "cuda", tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.fast_cases(2)
-@pytest.mark.parametrize("name", LEARNERS)
-@pytest.mark.parametrize("evolve", EVOLVE)
-def test_auto_is_the_cpu_where_there_is_nothing_else(
-    name: str, evolve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@each_learner
+@with_or_without
+def test_auto_is_the_cpu_where_there_is_nothing_else(name, evolve, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    found = []
-    for device in ("cpu", "auto"):
-        config, env = LEARNERS[name]
-        config, path = replace(config, device=device), tmp_path / device
-        train_agent(env, config, 256, path, quiet=True, evolve=evolve, checkpoint_every=200)
-        found.append(read_tensors(path / "policies" / "agent.safetensors")[0])
-    assert all(torch.equal(value, found[1][key]) for key, value in found[0].items())
+    runs = [train(name, evolve, device, tmp_path / device) for device in ("cpu", "auto")]
+    first, second = (run.policy.weights for run in runs)
+    assert all(torch.equal(value, second[key]) for key, value in first.items())
 
 
 @gpu
-@pytest.mark.parametrize("name", LEARNERS)
-@pytest.mark.parametrize("evolve", EVOLVE)
-def test_on_a_gpu_it_learns_and_its_policy_is_read_without_one(
-    name: str, evolve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config, env = LEARNERS[name]
-    config = replace(config, device="cuda")
-    run = train_agent(
-        env, config, 512, tmp_path / "run", quiet=True, evolve=evolve, checkpoint_every=200
-    )
+@each_learner
+@with_or_without
+def test_on_a_gpu_it_learns_and_its_policy_is_read_without_one(name, evolve, tmp_path, monkeypatch):
+    run = train(name, evolve, "cuda", tmp_path / "run", 512)
     assert all(v.device.type == "cpu" and v.isfinite().all() for v in run.policy.weights.values())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert len(run.evaluate(2).returns) == 2

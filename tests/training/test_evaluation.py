@@ -145,33 +145,6 @@ def test_no_episode_begins_that_nobody_asked_for():
     assert begun[7:] == [FIRST_SEED], "whether an environment that was used starts it again"
 
 
-def test_more_episodes_begin_with_the_same_ones_and_another_seed_has_others():
-    policy, spec = agent("CartPole-v1"), EnvSpec("CartPole-v1")
-    few, many = (evaluate(policy, spec, episodes=n, num_envs=4).returns for n in (6, 15))
-    assert many[:6] == few
-    assert evaluate(policy, spec, episodes=15, seed=1, num_envs=4).returns != many
-
-
-def test_every_policy_meets_the_same_starts():
-    starts = {}
-
-    def noting(name):
-        seen = starts.setdefault(name, set())
-
-        def act(obs):
-            seen.update(tuple(o) for o in obs if np.abs(o).max() <= 0.05)
-            return np.full(len(obs), int(name == "right"))
-
-        return ScriptedPolicy(act, *spaces("CartPole-v1"))
-
-    for name in ("left", "right"):
-        evaluate(noting(name), EnvSpec("CartPole-v1"), episodes=10, num_envs=3)
-    env = gym.make("CartPole-v1")
-    wanted = {tuple(env.reset(seed=FIRST_SEED + i)[0]) for i in range(10)}
-    assert starts["left"] >= wanted
-    assert starts["right"] >= wanted
-
-
 def test_acting_by_sampling_is_reproduced_by_the_seed_and_differs_from_greedy():
     policy, spec = agent("CartPole-v1"), EnvSpec("CartPole-v1")
 

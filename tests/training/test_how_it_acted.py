@@ -32,13 +32,13 @@ def told(name: str, experience: Batch) -> dict[str, float]:
     return {k: float(v) for k, v in how_it_acted(name, experience).items()}
 
 
-def test_of_a_skill_how_much_it_acted_and_its_own_reward_there() -> None:
+def test_of_a_skill_how_much_it_acted_and_its_own_reward_there():
     valid = np.array([[True, False], [False, True], [False, False]])
     assert told("inner/left", rows(valid)) == {"usage": np.float32(2 / 6), "reward": 1.5}
     assert told("left", rows(np.zeros((3, 2), bool))) == {"usage": 0.0}
 
 
-def test_of_a_selector_how_long_its_calls_were() -> None:
+def test_of_a_selector_how_long_its_calls_were():
     steps = np.array([[1, 5], [9, 9], [9, 9]])
     valid = np.array([[True, True], [False, False], [False, False]])
     assert told("selector", rows(valid, steps)) == {"call_length": 3.0}
@@ -46,12 +46,12 @@ def test_of_a_selector_how_long_its_calls_were() -> None:
     assert told("selector", rows(np.zeros((3, 2), bool), steps)) == {}
 
 
-def test_of_a_critic_nothing() -> None:
+def test_of_a_critic_nothing():
     assert told("skill_critic", rows()) == {}
 
 
 @pytest.mark.parametrize(("least", "deviation"), [(0.0, 1.0), (4.0, 0.5)])
-def test_a_task_that_says_little_moves_skills_little(least: float, deviation: float) -> None:
+def test_a_task_that_says_little_moves_skills_little(least, deviation):
     """The critic gives advantages in deviations of the return, 4 here; their own is 0.5."""
     config = SkillCritic(num_envs=2, n_steps=3, batch_size=6, min_advantage_std=least)
     seen, skills = gym.spaces.Box(-9, 9, (1,), np.float32), gym.spaces.Discrete(2)
@@ -59,7 +59,7 @@ def test_a_task_that_says_little_moves_skills_little(least: float, deviation: fl
     state = algorithm.init([Seeds(0)])
     state.return_var = torch.full_like(state.return_var, 16.0)
     given = torch.tensor([[[0.5, -0.5]] * 3])
-    algorithm.advantage = lambda *_: given  # type: ignore[method-assign]
+    algorithm.advantage = lambda *_: given
     learner = RolloutLearner(Stack(algorithm, state), Seeds(0))
     joint = JointLearner({"skill_critic": learner}, "", Together(task_weight=0.0))
     found = joint._task_advantage(rows())

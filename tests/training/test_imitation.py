@@ -1,9 +1,5 @@
 """A network learns the choices of another policy from pairs of observations and choices."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -14,7 +10,7 @@ from skillweave.training import imitation
 
 
 @pytest.mark.parametrize(("side", "drawn"), [(12, 100 * 32), (36, 60 * 16)])
-def test_large_images_are_learnt_from_fewer_rows(side: int, drawn: int, monkeypatch: Any) -> None:
+def test_large_images_are_learnt_from_fewer_rows(side, drawn, monkeypatch):
     monkeypatch.setattr(imitation, "GRADIENT_STEPS", 100)
     monkeypatch.setattr(imitation, "BATCH", 32)
     monkeypatch.setattr(imitation, "LARGE_STEPS", 60)
@@ -22,7 +18,7 @@ def test_large_images_are_learnt_from_fewer_rows(side: int, drawn: int, monkeypa
     rows = []
     likely = imitation.mask_logits
 
-    def counted(logits: Any, mask: Any) -> Any:
+    def counted(logits, mask):
         rows.append(logits.shape[1])
         return likely(logits, mask)
 

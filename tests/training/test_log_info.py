@@ -14,7 +14,7 @@ from small_runs import (
     ON,
     Heard,
     assert_same,
-    interrupt_at_checkpoint,
+    interrupted,
     lines,
     new_run,
     small_manifest,
@@ -42,14 +42,14 @@ from skillweave.evolution import Evolution
 from skillweave.hierarchy import training
 from skillweave.reporting.report.curves import read_curves
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import Manifest, identity, read_manifest
+from skillweave.runs.manifest import identity, read_manifest
 from skillweave.skills.outputs import info_keys
 
 
 class Told(Ledger):
     """A ledger with more in its info: its steps are ``t``."""
 
-    def step(self, action: int) -> Any:
+    def step(self, action: int):
         obs, reward, terminated, truncated, info = super().step(action)
         info |= {"late": self.t - 0.5, "flag": self.t > 2, "word": "text", "two": np.zeros(2)}
         info |= {"one": np.array([2.0]), "none": None, "nan": np.nan, "far": np.inf}
@@ -67,7 +67,7 @@ def spec(workers: int = 1) -> EnvSpec:
 class Place(gym.Wrapper[Any, Any, Any, Any]):
     """Episodes that can be played again after a checkpoint."""
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         obs, reward, terminated, truncated, info = self.env.step(action)
         info = {"place": float(obs[0])} | ({"right": 1} if obs[0] > 0 else {})
         return obs, reward, terminated, truncated, info
@@ -92,14 +92,14 @@ class Even(Odd):
     max_steps = 2
 
 
-def hierarchy(learn: str, algorithm: Any = ON, **how: Any) -> Hierarchy:
+def hierarchy(learn: str, algorithm=ON, **how) -> Hierarchy:
     return Hierarchy(
         spec(),
         [Odd(), Even()],
         algorithm=algorithm,
         selector=ON,
         call_steps=2,
-        learn=learn,  # type: ignore[arg-type]
+        learn=learn,
         apart=Apart(skill_steps=320, selector_steps=320),
         together=Together(steps=320),
         **how,
@@ -127,7 +127,7 @@ KINDS = {
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "a population"])
-def test_the_value_at_the_end_of_an_episode_is_logged_as_a_mean(kind: str, tmp_path: Path) -> None:
+def test_the_value_at_the_end_of_an_episode_is_logged_as_a_mean(kind, tmp_path):
     keys = ["t", "flag", "late"]
     KINDS[kind]().train(tmp_path / "run", quiet=True, log_info=keys)
     found = [x for x in lines(tmp_path / "run") if x["stage"] in ("agent", "selector", "together")]
@@ -142,7 +142,7 @@ def test_the_value_at_the_end_of_an_episode_is_logged_as_a_mean(kind: str, tmp_p
 @pytest.mark.parametrize(
     ("algorithm", "parts"), [(ON, 1), (ON, 2), (OFF, 1)], ids=["ppo", "two parts", "dqn"]
 )
-def test_populations_log_them(algorithm: Any, parts: int, tmp_path: Path) -> None:
+def test_populations_log_them(algorithm, parts, tmp_path):
     agent = Agent(spec(parts), algorithm, 4_400)
     agent.train(tmp_path / "run", quiet=True, log_info=["t", "lat"], evolve=Evolution(2, 2, 4))
     for line in lines(tmp_path / "run"):
@@ -151,7 +151,7 @@ def test_populations_log_them(algorithm: Any, parts: int, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_actors_of_ray_log_them(tmp_path: Path) -> None:
+def test_actors_of_ray_log_them(tmp_path):
     pytest.importorskip("ray")
     agent = Agent(spec(2), ON, 320)
     agent.train(tmp_path / "run", quiet=True, log_info=["t"], cluster=Ray(collectors=2))
@@ -160,7 +160,7 @@ def test_actors_of_ray_log_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*precision lowered")
-def test_pools_log_them(tmp_path: Path) -> None:
+def test_pools_log_them(tmp_path):
     pytest.importorskip("envpool")
     agent = Agent(EnvSpec("CartPole-v1", engine="envpool", workers=1), ON, 640)
     agent.train(tmp_path / "run", quiet=True, log_info=["elapsed_step"])
@@ -169,14 +169,14 @@ def test_pools_log_them(tmp_path: Path) -> None:
             assert line["info/elapsed_step"] == line["length"]
 
 
-def test_in_a_skills_own_stage_the_end_of_its_call_counts(tmp_path: Path) -> None:
+def test_in_a_skills_own_stage_the_end_of_its_call_counts(tmp_path):
     hierarchy("apart").train(tmp_path / "run", quiet=True, log_info=["t", "seldom"])
     even = [x for x in lines(tmp_path / "run") if x["stage"] == "even"]
     assert {x["info/t"] for x in even} == {2.0}
     assert all("info/seldom" not in x for x in even), "it comes in step 3"
 
 
-def test_what_is_no_finite_number_is_left_out(tmp_path: Path) -> None:
+def test_what_is_no_finite_number_is_left_out(tmp_path):
     Agent(spec(), ON, 320).train(
         tmp_path / "run", quiet=True, log_info=["seldom", "none", "nan", "far", "one"]
     )
@@ -186,7 +186,7 @@ def test_what_is_no_finite_number_is_left_out(tmp_path: Path) -> None:
         assert not {"info/none", "info/nan", "info/far"} & set(line)
 
 
-def said(declared: Any, path: Path, **how: Any) -> list[str]:
+def said(declared, path: Path, **how) -> list[str]:
     """Messages of a training."""
     heard = Heard()
     if isinstance(declared, Hierarchy):
@@ -198,7 +198,7 @@ def said(declared: Any, path: Path, **how: Any) -> list[str]:
     return [text for text in heard.said if "log_info" in text]
 
 
-def test_a_key_that_never_occurs_is_said_once_with_those_that_do(tmp_path: Path) -> None:
+def test_a_key_that_never_occurs_is_said_once_with_those_that_do(tmp_path):
     found = said(hierarchy("apart"), tmp_path / "run", log_info=["lte", "t", "nan"])
     assert len(found) == 2
     keys = "far, flag, late, nested, none, one, seldom, t, two, word"
@@ -207,7 +207,7 @@ def test_a_key_that_never_occurs_is_said_once_with_those_that_do(tmp_path: Path)
     assert found[1].endswith(f"in info['nan'] (log_info); there are: {keys}")
 
 
-def test_an_info_that_is_empty_is_said_to_be(tmp_path: Path) -> None:
+def test_an_info_that_is_empty_is_said_to_be(tmp_path):
     agent = Agent(EnvSpec("CartPole-v1", engine="sync", workers=1), ON, 320)
     (found,) = said(agent, tmp_path / "run", log_info=["fuel"])
     assert found.endswith("in info['fuel'] (log_info); it was empty there")
@@ -222,9 +222,7 @@ def test_an_info_that_is_empty_is_said_to_be(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_key_that_is_no_number_stops_the_training(
-    workers: int, key: str, what: str, tmp_path: Path
-) -> None:
+def test_a_key_that_is_no_number_stops_the_training(workers, key, what, tmp_path):
     with pytest.raises(EnvError, match=rf"info\['{key}'\] is {what} at the end of an ep"):
         Agent(spec(workers), ON, 320).train(tmp_path / "run", quiet=True, log_info=[key])
 
@@ -236,7 +234,7 @@ def test_a_key_that_is_no_number_stops_the_training(
         (["fuel", 3], r"^log_info\[1\] is 3; it must be a key of info, such as 'distance'"),
     ],
 )
-def test_wrong_lists_of_keys_are_refused(keys: Any, says: str, tmp_path: Path) -> None:
+def test_wrong_lists_of_keys_are_refused(keys, says, tmp_path):
     with pytest.raises(SkillweaveError, match=says):
         train_agent(Told, ON, 320, tmp_path / "run", log_info=keys)
     assert not (tmp_path / "run").exists()
@@ -246,27 +244,23 @@ def test_wrong_lists_of_keys_are_refused(keys: Any, says: str, tmp_path: Path) -
 @pytest.mark.parametrize(
     "kind", ["ppo", "dqn", "two processes", "together", "selector apart", "a population"]
 )
-def test_a_resumed_run_logs_the_same(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def declare() -> Any:
+def test_a_resumed_run_logs_the_same(kind, tmp_path):
+    def declare():
         declared = KINDS[kind]()
         declared.env = replace(declared.env, env=place)
         return declared
 
-    how: dict[str, Any] = {"log_info": ("place", "right"), "checkpoint_every": 70}
+    how = {"log_info": ("place", "right"), "checkpoint_every": 70}
     how |= {"evolve": Evolution(2, 3, 4)} if kind == "a population" else {}
     declare().train(tmp_path / "whole", quiet=True, **how)
-    with monkeypatch.context() as patch:
-        interrupt_at_checkpoint(patch, 2)
-        with pytest.raises(KeyboardInterrupt):
-            declare().train(tmp_path / "run", quiet=True, **how)
+    with interrupted(2):
+        declare().train(tmp_path / "run", quiet=True, **how)
     declare().resume(tmp_path / "run", quiet=True)
     assert_same(tmp_path / "run", tmp_path / "whole")
     assert {"info/place", "info/right"} <= set(lines(tmp_path / "run")[-1])
 
 
-def test_logging_changes_no_weights_and_no_identity(tmp_path: Path) -> None:
+def test_logging_changes_no_weights_and_no_identity(tmp_path):
     runs = [
         Agent(spec(), ON, 320).train(tmp_path / f"{i}", quiet=True, log_info=keys)
         for i, keys in enumerate([(), ("t", "t")])
@@ -281,13 +275,13 @@ def test_logging_changes_no_weights_and_no_identity(tmp_path: Path) -> None:
     ]
 
 
-def test_identity_counts_what_is_kept() -> None:
+def test_identity_counts_what_is_kept():
     manifest = small_manifest(stage_entry("agent"), log_info=("a",))
     assert identity(manifest) == identity(replace(manifest, log_info=()))
     assert identity(manifest) != identity(replace(manifest, keep="best"))
 
 
-def test_numbers_of_an_info() -> None:
+def test_numbers_of_an_info():
     info = {"x": np.array([1, 2, 3]), "_x": np.array([True, False, True]), "_own": 1}
     assert info_keys(info) == ("x", "_own")
     np.testing.assert_array_equal(info_numbers(info, "x", np.array([2, 1]), 3), [3.0, np.nan])
@@ -304,17 +298,17 @@ class Mixed(gym.Env[Any, Any]):
     action_space = gym.spaces.Discrete(2)
     made = 0
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int):
         self.value = (False, 2, 0.5, None)[(number + Mixed.made) % 4]
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+    def reset(self, *, seed=None, options=None):
         return np.zeros(1, np.float32), {}
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         return np.zeros(1, np.float32), 0.0, False, False, {"x": self.value}
 
 
-def test_numbers_of_several_types_keep_their_values() -> None:
+def test_numbers_of_several_types_keep_their_values():
     info = GymnasiumEngine(Mixed, 3, "mixed").step(np.zeros(3, np.int64)).info
     np.testing.assert_array_equal(info["x"], [0.0, 2.0, 0.5])
     Mixed.made = 1
@@ -352,27 +346,23 @@ hierarchy = sw.Hierarchy(
 """
 
 
-def test_the_command_line_logs_and_keeps(tmp_path: Path) -> None:
+def test_the_command_line_logs_and_keeps(tmp_path):
     (tmp_path / "recipe.py").write_text(RECIPE)
     words = ["train", str(tmp_path / "recipe.py"), "--evaluate", "0", "--quiet"]
     best = ["--keep", "best", "--set", "train.eval_every=100", "--set", "train.eval_episodes=2"]
     first, second = tmp_path / "first", tmp_path / "second"
     assert main([*words, "-o", str(first), "--log-info", "place", *best]) == 0
     assert "info/place" in lines(first)[-1]
-    (stage,) = manifest_of(first).stages
+    (stage,) = read_manifest(first).stages
     assert stage.best.steps <= stage.steps
     more = ["--set", "train.keep=best", "--set", "train.log_info=place, other"]
     assert main([*words, "-o", str(second), *best[2:], *more]) == 0
-    assert manifest_of(second).log_info == ("place", "other")
-    assert manifest_of(second).keep == "best"
+    assert read_manifest(second).log_info == ("place", "other")
+    assert read_manifest(second).keep == "best"
     assert main([*words, "-o", str(tmp_path / "third"), "--keep", "best"]) != 0
 
 
-def manifest_of(path: Path) -> Manifest:
-    return read_manifest(path)
-
-
-def test_progress_and_curves_show_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_and_curves_show_them(tmp_path, capsys):
     run = Agent(spec(), ON, 320).train(tmp_path / "run", log_info=["t"])
     assert "info/t 3" in capsys.readouterr().err
     directory = RunDirectory.open(run.path)

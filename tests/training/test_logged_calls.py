@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from small_runs import (
@@ -13,11 +10,11 @@ from small_runs import (
     Left,
     Push,
     assert_same,
-    interrupt_at_checkpoint,
+    interrupted,
 )
 
 from skillweave import EnvSpec, Hierarchy, Lengths, Ray, Run, Skill, TrainDefaults
-from skillweave.errors import DeclarationError, EnvError, Interrupted, RunError
+from skillweave.errors import DeclarationError, EnvError, RunError
 from skillweave.evolution import Evolution
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.planning import CallLog
@@ -38,12 +35,12 @@ class Nod(Skill):
         lambda obs: np.ones(len(obs), np.int64), CARTPOLE.spaces.observation, CARTPOLE.spaces.action
     )
 
-    def success(self, step: Any) -> Any:
+    def success(self, step):
         return step.next_obs[:, 2] > 0
 
 
-def declare(learn: Any = "apart", **how: Any) -> Hierarchy:
-    given: dict[str, Any] = {
+def declare(learn="apart", **how) -> Hierarchy:
+    given = {
         "env": CARTPOLE,
         "skills": [Left(), Nod(), Push()],
         "algorithm": ON,
@@ -52,12 +49,10 @@ def declare(learn: Any = "apart", **how: Any) -> Hierarchy:
         "steps": 900,
         "learn": learn,
     }
-    given |= how
-    env, skills = given.pop("env"), given.pop("skills")
-    return Hierarchy(env, skills, **given)
+    return Hierarchy(**given | how)
 
 
-def assert_whole(log: CallLog, policy: Any, limits: dict[str, int]) -> None:
+def assert_whole(log: CallLog, policy, limits: dict[str, int]):
     """Every call is one that the skills make from its start, and follows the one before."""
     assert isinstance(policy, HierarchyPolicy)
     skills = policy.skills
@@ -95,7 +90,7 @@ def assert_whole(log: CallLog, policy: Any, limits: dict[str, int]) -> None:
 LIMITS = {"left": 4, "nod": 3, "push": 2}
 
 
-def test_a_selectors_training_logs_whole_calls_and_learns_the_same(tmp_path: Path) -> None:
+def test_a_selectors_training_logs_whole_calls_and_learns_the_same(tmp_path):
     without = declare().train(tmp_path / "a", seed=3, quiet=True)
     run = declare().train(tmp_path / "b", seed=3, quiet=True, log_calls=400)
     assert_same(tmp_path / "b", tmp_path / "a")
@@ -115,7 +110,7 @@ def test_a_selectors_training_logs_whole_calls_and_learns_the_same(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_skills_that_learn_meanwhile_are_counted_and_not_planned_with(tmp_path: Path) -> None:
+def test_skills_that_learn_meanwhile_are_counted_and_not_planned_with(tmp_path):
     declared = declare("together", train_defaults=TrainDefaults(log_calls=500))
     run = declared.train(tmp_path / "run", seed=3, quiet=True)
     without = declare("together").train(tmp_path / "other", seed=3, quiet=True)
@@ -130,11 +125,11 @@ def test_skills_that_learn_meanwhile_are_counted_and_not_planned_with(tmp_path: 
 
 
 @pytest.mark.slow
-def test_chosen_lengths_interruption_and_keys_of_info(tmp_path: Path) -> None:
+def test_chosen_lengths_interruption_and_keys_of_info(tmp_path):
     import gymnasium as gym
 
-    class Leaning(gym.Wrapper):  # type: ignore[type-arg]
-        def step(self, action: Any) -> Any:
+    class Leaning(gym.Wrapper):
+        def step(self, action):
             obs, reward, terminated, truncated, info = self.env.step(action)
             return obs, reward, terminated, truncated, info | {"lean": obs[2]}
 
@@ -166,21 +161,19 @@ class Balanced(Balance):
 
     max_steps = 3
 
-    def policy(self, obs: Any) -> Any:
+    def policy(self, obs):
         return (obs[:, 3] > 0).astype(np.int64)
 
 
 @pytest.mark.slow
-def test_a_run_that_continues_keeps_its_settings(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_continues_keeps_its_settings(tmp_path, capsys):
     declare().train(tmp_path / "run", quiet=True)
     capsys.readouterr()
     declare(steps=1_200).train(tmp_path / "run", resume=True, log_calls=200)
     assert "continues as it began, with no log of calls" in capsys.readouterr().err
 
 
-def test_a_log_without_a_call_says_so(tmp_path: Path) -> None:
+def test_a_log_without_a_call_says_so(tmp_path):
     with pytest.warns(UserWarning, match="no whole call was recorded in the latest 1 steps"):
         declare(skills=[Nod(), Nodding()]).train(tmp_path / "run", quiet=True, log_calls=1)
 
@@ -190,21 +183,17 @@ class Nodding(Nod):
 
 
 @pytest.mark.slow
-def test_a_resumed_run_ends_with_the_same_weights(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resumed_run_ends_with_the_same_weights(tmp_path):
     declare().train(tmp_path / "a", seed=3, quiet=True, checkpoint_every=100)
-    with monkeypatch.context() as patch:
-        interrupt_at_checkpoint(patch, 4)
-        with pytest.raises(Interrupted):
-            declare().train(tmp_path / "b", seed=3, quiet=True, log_calls=500, checkpoint_every=100)
+    with interrupted(4):
+        declare().train(tmp_path / "b", seed=3, quiet=True, log_calls=500, checkpoint_every=100)
     run = declare().resume(tmp_path / "b", quiet=True)
     assert_same(tmp_path / "b", tmp_path / "a")
     assert 100 < run.calls.steps <= 500
     assert_whole(run.calls, run.policy, LIMITS)
 
 
-def assert_equal(a: CallLog, b: CallLog) -> None:
+def assert_equal(a: CallLog, b: CallLog):
     assert columns_of(a).keys() == columns_of(b).keys()
     for name, column in columns_of(a).items():
         assert np.array_equal(column, columns_of(b)[name]), name
@@ -213,7 +202,7 @@ def assert_equal(a: CallLog, b: CallLog) -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning")
 @pytest.mark.filterwarnings("ignore:CartPole-v1. its 2 collectors work in this process")
-def test_collectors_elsewhere_log_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_collectors_elsewhere_log_the_same(tmp_path, monkeypatch):
     """In two processes, in two actors of Ray, and one after the other in this thread."""
     two = declare(env=EnvSpec("CartPole-v1", engine="sync", workers=2))
     there = two.train(tmp_path / "a", seed=3, quiet=True, log_calls=400).calls
@@ -230,7 +219,7 @@ def test_collectors_elsewhere_log_the_same(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.slow
-def test_environments_in_a_pool(tmp_path: Path) -> None:
+def test_environments_in_a_pool(tmp_path):
     pytest.importorskip("envpool")
     pool = declare(env=EnvSpec("CartPole-v1", engine="envpool"))
     run = pool.train(tmp_path / "run", seed=3, quiet=True, log_calls=400)
@@ -240,7 +229,7 @@ def test_environments_in_a_pool(tmp_path: Path) -> None:
     assert np.unique(score.calls.episode).tolist() == list(range(20))
 
 
-REFUSED: Any = [
+REFUSED = [
     ({"log_calls": 0}, "log_calls is 0"),
     ({"log_calls": 10**10}, "at most 4 GiB are recorded"),
     ({"log_calls_info": ["lean"]}, "set log_calls, too"),
@@ -251,13 +240,13 @@ REFUSED: Any = [
 
 
 @pytest.mark.parametrize(("how", "message"), REFUSED)
-def test_what_cannot_be_logged_is_refused(how: Any, message: str, tmp_path: Path) -> None:
+def test_what_cannot_be_logged_is_refused(how, message, tmp_path):
     with pytest.raises(DeclarationError, match=message):
         declare().train(tmp_path / "run", quiet=True, **how)
     assert not (tmp_path / "run").exists()
 
 
-def test_skills_that_learn_apart_below_a_ready_selector_are_not_called(tmp_path: Path) -> None:
+def test_skills_that_learn_apart_below_a_ready_selector_are_not_called(tmp_path):
     declared = declare(selector=lambda obs: np.full(len(obs), "left"))
     with pytest.raises(DeclarationError, match="no selector acts while this hierarchy trains"):
         declared.train(tmp_path / "run", quiet=True, log_calls=50)

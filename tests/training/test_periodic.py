@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +42,7 @@ def played(env: Toy, seed: int = 0) -> list[float]:
     return episodes_of(fresh(env), who, env, Seeds(seed))[:, RETURN].tolist()
 
 
-def played_by_hand(env: Any, policy: AgentPolicy) -> list[float]:
+def played_by_hand(env, policy: AgentPolicy) -> list[float]:
     """The return of each environment's first episode, one environment at a time."""
     found = []
     for i in range(env.num_envs):
@@ -70,7 +69,7 @@ def test_an_episode_that_never_ends_counts_as_it_stands_at_the_limit(monkeypatch
     class Forever(Countdown):
         """Pays 1 a step; only the first environment ends, after 5 steps."""
 
-        def play(self, action: Any) -> Any:
+        def play(self, action):
             obs, reward, terminated, truncated = super().play(action)
             return np.minimum(obs, 5), reward, terminated & (np.arange(2) == 0), truncated
 
@@ -90,10 +89,10 @@ def test_equal_seeds_give_equal_starts_and_others_other_ones():
 
 
 def test_an_evaluation_is_made_once_in_every_so_many_steps():
-    learning_task: Any = SimpleNamespace(engine=Countdown)
+    learning_task = SimpleNamespace(engine=Countdown)
     policy = fresh(Countdown(1))
 
-    def play(engine: Any, seeds: Seeds) -> Any:
+    def play(engine, seeds: Seeds):
         return episodes_of(policy, Alone(), engine, seeds)
 
     evaluation = PeriodicEvaluation(learning_task, Seeds(0), 100, 3, 8)

@@ -2,18 +2,14 @@
 
 import pytest
 from declaring import plainly
+from small_runs import Left
 
 from skillweave import DQN, SAC, Apart, Hierarchy, Network, train_agent
 from skillweave.errors import SkillweaveError, TrainingError
 from skillweave.evolution import Evolution
-from skillweave.skills import Skill
 
 SMALL = {"num_envs": 4, "batch_size": 8, "learning_starts": 40, "network": Network((4,))}
 HUGE = {"buffer_size": 10**12, **SMALL}
-
-
-class Left(Skill):
-    pass
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -26,6 +25,7 @@ from skillweave import (
     TrainDefaults,
     train_agent,
 )
+from skillweave.cli import main
 from skillweave.evolution import Evolution
 from skillweave.evolution.plan import plan
 from skillweave.hierarchy import training
@@ -47,12 +47,12 @@ class Walk(gym.Env[Any, Any]):
     observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float32)
     action_space = gym.spaces.Discrete(2)
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+    def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.t, self.lucky = 0, bool(self.np_random.random() < 0.5)
         return np.zeros(1, np.float32), {}
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         self.t += 1
         info = {"success": self.t == 10 and self.lucky}
         return np.array([self.t / 10], np.float32), 1.0, self.t == 10, False, info
@@ -72,9 +72,7 @@ WALK = EnvSpec(Walk, engine="sync")
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("algorithm", [SMALL, REPLAY])
-def test_training_ends_at_the_first_evaluation_that_is_good_enough(
-    tmp_path: Path, algorithm: Any, made: list[int]
-) -> None:
+def test_training_ends_at_the_first_evaluation_that_is_good_enough(tmp_path, algorithm, made):
     run = train_agent(
         WALK, algorithm, 2_000, tmp_path / "run", target_return=10.0, eval_every=200,
         eval_episodes=3, quiet=True,
@@ -91,7 +89,7 @@ def test_training_ends_at_the_first_evaluation_that_is_good_enough(
     assert run.evaluate(2).mean == 10.0
 
 
-def test_a_target_that_is_not_reached_changes_nothing(tmp_path: Path) -> None:
+def test_a_target_that_is_not_reached_changes_nothing(tmp_path):
     weights = []
     for target in (None, 11.0):
         run = train_agent(
@@ -109,10 +107,10 @@ def test_a_target_that_is_not_reached_changes_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("algorithm", [SMALL, REPLAY])
 @pytest.mark.parametrize("where", ["an evaluation before", "the target", "its policy"])
 def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algorithm: Any, where: str
-) -> None:
+    tmp_path, monkeypatch, algorithm, where
+):
     # Evaluations every 100 steps tell 1, 2, 3, …; each falls together with a checkpoint.
-    def due(self: Any, since: int, steps: int, policy: Any, **how: Any) -> dict[str, float]:
+    def due(self, since: int, steps: int, policy, **how) -> dict[str, float]:
         return {"eval_return": float(steps // 100)} if steps // 100 > since // 100 else {}
 
     monkeypatch.setattr(PeriodicEvaluation, "due", due)
@@ -129,7 +127,7 @@ def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
         else:
             at, reached_at = [0], Target.reached
 
-            def dies(self: Any, metrics: Any, stage: str) -> Any:
+            def dies(self, metrics, stage: str):
                 at[0] = max(at[0], int(metrics.get("eval_return", 0)))
                 if at[0] == (2 if where == "an evaluation before" else 4):
                     raise ZeroDivisionError
@@ -142,16 +140,14 @@ def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
     again = agent.resume(tmp_path / "run", quiet=True)
     ours, theirs = again.info()["stages"][0], whole.info()["stages"][0]
     assert (ours["reached"], ours["steps"]) == (theirs["reached"], theirs["steps"])
-    for key, value in whole.policy.weights.items():  # type: ignore[attr-defined]
-        assert torch.equal(value, again.policy.weights[key]), key  # type: ignore[attr-defined]
+    for key, value in whole.policy.weights.items():
+        assert torch.equal(value, again.policy.weights[key]), key
     records = (list(RunDirectory.open(r.path).metrics()) for r in (whole, again))
     for a, b in zip(*records, strict=True):
         assert {**a, "seconds": 0} == {**b, "seconds": 0}
 
 
-def test_skills_and_selector_have_targets_of_their_own(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_skills_and_selector_have_targets_of_their_own(tmp_path, capsys):
     kinds = {"max_steps": 3, "target_return": 3.0}
     quick = type("Quick", (Skill,), kinds)()
     sure = type("Sure", (Start,), {"target_success": 1.0})()
@@ -179,7 +175,7 @@ def test_skills_and_selector_have_targets_of_their_own(
     assert "success 1, the target is 1" in said
 
 
-def test_the_success_of_an_agent_is_what_its_environment_tells(tmp_path: Path) -> None:
+def test_the_success_of_an_agent_is_what_its_environment_tells(tmp_path):
     agent = Agent(WALK, SMALL, 640, target_success=0.99)
     run = agent.train(tmp_path / "run", quiet=True, eval_every=100, eval_episodes=20)
     (entry,) = run.info()["stages"]
@@ -190,14 +186,14 @@ def test_the_success_of_an_agent_is_what_its_environment_tells(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_a_success_that_nobody_tells_is_an_error(tmp_path: Path) -> None:
+def test_a_success_that_nobody_tells_is_an_error(tmp_path):
     agent = Agent("CartPole-v1", SMALL, 200, target_success=0.5)
     with pytest.raises(SkillweaveError, match=r"agent.*target_success.*info\['success'\]"):
         agent.train(tmp_path / "run", quiet=True, eval_every=50, eval_episodes=1)
 
 
-def test_a_population_ends_at_its_stages_target(tmp_path: Path) -> None:
-    how: Any = {"evolve": Evolution(2, 5, 1), "quiet": True}
+def test_a_population_ends_at_its_stages_target(tmp_path):
+    how = {"evolve": Evolution(2, 5, 1), "quiet": True}
     run = train_agent(WALK, SMALL, 500, tmp_path / "run", target_return=10.0, **how)
     (entry,) = run.info()["stages"]
     assert entry["winner"]["generations"] == 1
@@ -218,15 +214,13 @@ def test_a_population_ends_at_its_stages_target(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_target_that_cannot_be_is_refused_before_anything_is_written(
-    tmp_path: Path, settings: Any, says: str
-) -> None:
+def test_a_target_that_cannot_be_is_refused_before_anything_is_written(tmp_path, settings, says):
     with pytest.raises(SkillweaveError, match=says):
         train_agent(WALK, SMALL, 100, tmp_path / "run", quiet=True, **settings)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_skill_without_success_has_no_target_success() -> None:
+def test_a_skill_without_success_has_no_target_success():
     blind = type("Blind", (Skill,), {"target_success": 0.5})()
     with pytest.raises(SkillweaveError, match=r"skill 'blind'.*define success\(\)"):
         Hierarchy(WALK, [blind], learn="apart")
@@ -238,7 +232,7 @@ def test_a_skill_without_success_has_no_target_success() -> None:
 # The stage itself
 
 
-def test_a_stage_that_evolves_is_not_trained_by_one_agent(tmp_path: Path) -> None:
+def test_a_stage_that_evolves_is_not_trained_by_one_agent(tmp_path):
     h = Hierarchy(WALK, [Start()], algorithm=SMALL, selector=SMALL, learn="apart")
     content = training.manifest(h, seed=0, flat=True)
     plan(content.stages, Evolution(2, 2, 1))
@@ -250,7 +244,7 @@ def test_a_stage_that_evolves_is_not_trained_by_one_agent(tmp_path: Path) -> Non
         run.close()
 
 
-def test_a_stage_says_who_learns_and_who_decides(tmp_path: Path) -> None:
+def test_a_stage_says_who_learns_and_who_decides(tmp_path):
     h = Hierarchy(WALK, [Start()], algorithm=SMALL, selector=SMALL, learn="apart")
     entries = training.manifest(h, seed=0, flat=False).stages
     assert [(e.name, e.kind, e.learns, e.decides) for e in entries] == [
@@ -265,14 +259,17 @@ def test_a_stage_says_who_learns_and_who_decides(tmp_path: Path) -> None:
     ]
 
 
-def test_an_agent_is_loaded_without_a_hierarchy(tmp_path: Path) -> None:
+def test_an_agent_is_loaded_without_a_hierarchy(tmp_path, capsys):
     agent = Agent("CartPole-v1", SMALL, 64)
     run = agent.train(tmp_path / "run", seed=2, quiet=True)
     again = agent.load(run.path)
     assert isinstance(again.declaration, Agent)
     assert again.evaluate(3).returns == run.evaluate(3).returns
-    saved = Agent.from_weights(run.save_weights(tmp_path / "a.safetensors"))
-    assert saved.evaluate(3).returns == run.evaluate(3).returns
+    file = run.save_weights(tmp_path / "a.safetensors")
+    assert Agent.from_weights(file).evaluate(3).returns == run.evaluate(3).returns
+    for path in (run.path, file):
+        assert main(["evaluate", str(path), "--episodes", "3", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["mean"] == run.evaluate(3).mean
     for what in (lambda: run.hierarchy, lambda: run.evaluate(1, skill="x")):
         with pytest.raises(SkillweaveError, match="plain agent"):
             what()
@@ -281,7 +278,7 @@ def test_an_agent_is_loaded_without_a_hierarchy(tmp_path: Path) -> None:
     json.dumps(run.info())
 
 
-def test_a_hierarchys_run_is_no_agents(tmp_path: Path) -> None:
+def test_a_hierarchys_run_is_no_agents(tmp_path):
     h = Hierarchy(
         WALK,
         [Start()],
