@@ -13,6 +13,7 @@ from pages import BLOCK, INCLUDED, ROOT, run_page, train_briefly
 from skillweave._internal.public import HOMES
 from skillweave.cli.commands import COMMANDS, name_of
 
+README = ROOT / "README.md"
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 NEEDS = {
     "docs/tutorials/first-hierarchy.md": ("Box2D",),
@@ -50,13 +51,13 @@ def test_pages_show_whole_files_that_exist() -> None:
     assert [path for path in shown if not (ROOT / path).is_file()] == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
+@pytest.mark.parametrize("page", [README, *PAGES], ids=name)
 def test_every_command_of_a_page_exists(page: Path) -> None:
     used = set(re.findall(r"^\s*skillweave ([\w-]+)", page.read_text(), flags=re.M))
     assert used <= {name_of(c) for c in COMMANDS}
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=name)
+@pytest.mark.parametrize("page", [README, *PAGES], ids=name)
 def test_modules_that_a_page_tells_to_run_exist(page: Path) -> None:
     modules = re.findall(r"python -m (benchmarks\.\w+)", page.read_text())
     places = {m: ROOT / m.replace(".", "/") for m in modules}

@@ -79,8 +79,7 @@ def test_processes_end_soon_after_their_parent_was_killed(what, tmp_path):
     parent = subprocess.Popen(command, cwd=tmp_path, env=os.environ | paths)
     until = time.monotonic() + 60
     while time.monotonic() < until and not (
-        len(numbers(tmp_path, "pid")) == 2
-        and (what == "constructor" or numbers(tmp_path, "step"))
+        len(numbers(tmp_path, "pid")) == 2 and (what == "constructor" or numbers(tmp_path, "step"))
     ):
         time.sleep(0.1)
     time.sleep(1.0)  # well in what blocks

@@ -14,15 +14,6 @@ def test_the_example_of_the_readme_is_one_of_the_examples() -> None:
     assert (ROOT / "examples/key_door.py").read_text().endswith(block)
 
 
-def test_every_shell_command_of_the_readme_is_one_that_exists() -> None:
-    from skillweave.cli.commands import COMMANDS, name_of
-
-    known = {name_of(c) for c in COMMANDS}
-    used = set(re.findall(r"^skillweave ([\w-]+)", TEXT, flags=re.M))
-    assert used
-    assert used <= known
-
-
 def test_every_target_of_make_that_the_readme_names_exists() -> None:
     makefile = (ROOT / "Makefile").read_text()
     used = set(re.findall(r"`make ([\w-]+)`", TEXT, flags=re.M))

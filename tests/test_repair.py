@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -122,15 +122,24 @@ def declare(*skills: sw.Skill, algorithm: Any = ON, steps: int = STEPS, **how: A
     return sw.Hierarchy(SPEC, skills, algorithm=algorithm, **settings | how)
 
 
-@pytest.fixture(autouse=True)
-def _small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(repair, "CHUNK", 1_500)
-    monkeypatch.setattr(repair, "ENOUGH_STEPS", 3_000)
+@pytest.fixture(autouse=True, scope="module")
+def _small() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(repair, "CHUNK", 1_500)
+        patch.setattr(repair, "ENOUGH_STEPS", 3_000)
+        yield
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return declare().train(tmp_path_factory.mktemp("runs") / "buttons", quiet=True)
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run of a skill that cannot become better."""
+    folder = tmp_path_factory.mktemp("runs")
+    return declare(Wrong(), Flip(), steps=512).train(folder / "wrong", quiet=True)
 
 
 def repaired(run: Run, path: Path | None, **how: Any) -> Run:
@@ -278,22 +287,20 @@ def test_calls_of_a_repair_have_the_selectors_limit() -> None:
     assert collector.limit == 5, "of 8 by itself"
 
 
-def test_what_is_not_better_is_not_kept(tmp_path: Path) -> None:
-    first = declare(Wrong(), Flip(), steps=512).train(tmp_path / "run", quiet=True)
-    new = repaired(first, tmp_path / "new", **SHORT)
+def test_what_is_not_better_is_not_kept(wrong: Run, tmp_path: Path) -> None:
+    new = repaired(wrong, tmp_path / "new", **SHORT)
     (result,) = new.repairs
     assert not result.kept
     assert result.sentence.endswith("not clearly better, so the earlier weights are kept")
     again = sw.load(new.path, declare(Wrong(), Flip()))
-    assert weights(first) == weights(new) == weights(again)
+    assert weights(wrong) == weights(new) == weights(again)
 
 
 def test_measuring_stops_and_says_what_was_not_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    wrong: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(repair, "MOST_STEPS", 4_000)
-    first = declare(Wrong(), Flip(), steps=512).train(tmp_path / "run", quiet=True)
-    (result,) = repaired(first, tmp_path / "new", **SHORT | {"calls": 100_000}).repairs
+    (result,) = repaired(wrong, tmp_path / "new", **SHORT | {"calls": 100_000}).repairs
     stopped = (
         r"Measuring stopped after 4,\d+ steps: 100,000 calls of press after flip were wanted, and "
         r"there were \d+; flip was done in [\d,]+ of [\d,]+ calls\.$"
@@ -329,11 +336,7 @@ def matrix(*rows: tuple[float, float]) -> Handover:
         (((0.9, 0.9), (0.9, 0.8), (0.9, 0.9)), True, "no other pair is clearly worse"),
         (((0.9, 0.9), (0.9, 0.3), (0.9, 0.9)), False, "b after a: 20% of 100 calls"),
         (((0.9, 0.9), (0.9, 0.0), (0.9, 0.9)), False, "not clearly better"),
-        (
-            ((0.9, 0.6), (0.9, 0.8), (0.9, 0.9)),
-            False,
-            "b after start: 90% of 100 calls",
-        ),
+        (((0.9, 0.6), (0.9, 0.8), (0.9, 0.9)), False, "b after start: 90% of 100 calls"),
         (((0.9, 0.9), (0.9, 0.8), (0.6, 0.9)), False, "a after b: 90% of 100 calls"),
         (((0.9, 0.85), (0.9, 0.8), (0.9, 0.9)), True, "b after a: 20%"),
     ],
@@ -361,22 +364,23 @@ SHORT = {"steps": 1_024, "calls": 5}
 """Too few steps to become better."""
 
 
-def stop_at(report: int) -> Callable[[Any], None]:
-    left = [report]
+def stop(event: Any) -> None:
+    if event.steps >= 512:
+        raise KeyboardInterrupt
 
-    def callback(event: Any) -> None:
-        left[0] -= 1
-        if not left[0]:
-            raise KeyboardInterrupt
 
-    return callback
+@pytest.fixture(scope="module")
+def whole(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A repair that was not stopped."""
+    return repaired(run, tmp_path_factory.mktemp("runs") / "whole", **SHORT)
 
 
 @pytest.mark.parametrize("by", ["hierarchy", "repair"])
-def test_a_stopped_repair_ends_with_the_same_weights(run: Run, tmp_path: Path, by: str) -> None:
-    whole = repaired(run, tmp_path / "whole", **SHORT)
+def test_a_stopped_repair_ends_with_the_same_weights(
+    run: Run, whole: Run, tmp_path: Path, by: str
+) -> None:
     with pytest.raises(Interrupted, match=r'run\.repair\("press", after="flip", run_dir='):
-        repaired(run, tmp_path / "part", callback=stop_at(3), **SHORT)
+        repaired(run, tmp_path / "part", callback=stop, **SHORT)
     assert not RunDirectory.open(tmp_path / "part").finished
     if by == "repair":
         new = repaired(run, tmp_path / "part", resume=True)
@@ -387,18 +391,15 @@ def test_a_stopped_repair_ends_with_the_same_weights(run: Run, tmp_path: Path, b
 
 
 def test_a_repair_that_was_stopped_while_it_was_measured_goes_on(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, whole: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = repaired(run, tmp_path / "whole", **SHORT)
-    judge = repair.verdict
-
     def stopped(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(repair, "verdict", stopped)
-    with pytest.raises(Interrupted):
-        repaired(run, tmp_path / "part", **SHORT)
-    monkeypatch.setattr(repair, "verdict", judge)
+    with monkeypatch.context() as patch:
+        patch.setattr(repair, "verdict", stopped)
+        with pytest.raises(Interrupted):
+            repaired(run, tmp_path / "part", **SHORT)
     stages = RunDirectory.open(tmp_path / "part").manifest.stages
     assert all(entry.done for entry in stages)
     with pytest.raises(RunError, match=r"run\.repair"):
@@ -412,7 +413,7 @@ def test_events_of_the_caller_judge_and_are_needed_again(run: Run, tmp_path: Pat
         repaired(run, tmp_path / "a", done=done)
     done = {"press": at_goal}
     with pytest.raises(Interrupted, match="done=…"):
-        repaired(run, tmp_path / "b", done=done, callback=stop_at(2), **SHORT)
+        repaired(run, tmp_path / "b", done=done, callback=stop, **SHORT)
     with pytest.raises(RunError, match=r"is judged by done= of press, which is code: continue"):
         declare().resume(tmp_path / "b", quiet=True)
     assert len(repaired(run, tmp_path / "b", done=done, resume=True).repairs) == 1
@@ -420,21 +421,17 @@ def test_events_of_the_caller_judge_and_are_needed_again(run: Run, tmp_path: Pat
         repaired(run, tmp_path / "c", done={"zero": at_goal})
 
 
-def test_a_repaired_run_is_repaired_again(run: Run, tmp_path: Path) -> None:
-    first = repaired(run, tmp_path / "first", **SHORT | {"steps": 256})
+def test_a_weights_file_is_repaired_and_a_repaired_run_again(run: Run, tmp_path: Path) -> None:
+    run.save_weights(tmp_path / "buttons.safetensors")
+    loaded = declare().load_weights(tmp_path / "buttons.safetensors")
+    first = repaired(loaded, tmp_path / "first", **SHORT | {"steps": 256})
+    assert len(first.repairs) == 1
+    assert weights(sw.load(tmp_path / "first", declare())) == weights(first)
+    assert not loaded.repairs
     second = repaired(first, tmp_path / "second", **SHORT)
     assert [r.kept for r in second.repairs] == [False, False]
     names = [entry["name"] for entry in second.info()["stages"]]
     assert names == ["press", "press-repair", "press-repair-2"]
-
-
-def test_a_weights_file_is_repaired(run: Run, tmp_path: Path) -> None:
-    run.save_weights(tmp_path / "buttons.safetensors")
-    loaded = declare().load_weights(tmp_path / "buttons.safetensors")
-    new = repaired(loaded, tmp_path / "new", **SHORT)
-    assert len(new.repairs) == 1
-    assert weights(sw.load(tmp_path / "new", declare())) == weights(new)
-    assert not loaded.repairs
 
 
 @pytest.mark.slow
