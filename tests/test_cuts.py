@@ -18,7 +18,6 @@ from small_runs import (
     OFF,
     ON,
     Balance,
-    Heard,
     Left,
     Push,
     Whole,
@@ -153,9 +152,7 @@ def at_random_places(share: float, seed: int, stop_after: int | None = None) -> 
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", KINDS)
-def test_checkpoints_at_twenty_random_places_change_no_weight_and_no_report(
-    kind: str, tmp_path: Path, whole: Whole
-) -> None:
+def test_checkpoints_at_twenty_random_places_change_no_weight_and_no_report(kind, tmp_path, whole):
     _, reference = whole(kind)
     with at_random_places(0.5 if kind.startswith("plain") else 0.95, 0) as places:
         whole.train(kind, tmp_path / "run")
@@ -165,9 +162,7 @@ def test_checkpoints_at_twenty_random_places_change_no_weight_and_no_report(
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_that_stops_at_checkpoints_and_goes_on_ends_as_one_without_any(
-    kind: str, tmp_path: Path, whole: Whole
-) -> None:
+def test_a_run_that_stops_at_checkpoints_and_goes_on_ends_as_one_without_any(kind, tmp_path, whole):
     (_, reference), path, stops = whole(kind), tmp_path / "run", 0
     for seed in range(100):
         # Sometimes it goes on from a checkpoint that is not the latest round's.
@@ -193,8 +188,8 @@ def populations(tmp_path_factory: pytest.TempPathFactory) -> Whole:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", POPULATIONS)
 def test_a_population_that_stops_after_generations_ends_as_one_that_does_not(
-    kind: str, tmp_path: Path, populations: Whole, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    kind, tmp_path, populations, monkeypatch
+):
     (_, reference), path = populations(kind), tmp_path / "run"
     monkeypatch.setattr(interrupts, "requested", lambda: True)
     with pytest.raises(KeyboardInterrupt):
@@ -209,9 +204,7 @@ def test_a_population_that_stops_after_generations_ends_as_one_that_does_not(
 
 
 @pytest.mark.slow
-def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(
-    tmp_path: Path, whole: Whole
-) -> None:
+def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(tmp_path, whole):
     sizes, (_, reference) = [], whole("plain, dqn")
     for saved in (True, False):
         path, agent = tmp_path / str(saved), plain(replace(OFF, save_buffer=saved), SYNC)()
@@ -225,9 +218,7 @@ def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(
     assert [r["steps"] for r in lines(path)] == [r["steps"] for r in lines(reference)]
 
 
-def test_a_checkpoint_is_written_when_the_latest_is_old(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_checkpoint_is_written_when_the_latest_is_old(tmp_path, monkeypatch):
     saved: list[int] = []
     monkeypatch.setattr(RunDirectory, "save_checkpoint", lambda *_: saved.append(1))
     monkeypatch.setattr("skillweave.training.loop.CHECKPOINT_SHARE", 1e9)
@@ -238,39 +229,22 @@ def test_a_checkpoint_is_written_when_the_latest_is_old(
     assert len(saved) == 1 + STEPS // 32
 
 
-class Interrupt(Heard):
-    """A listener that sends this process signals at a tick."""
+def interrupted(path: Path, declared: Agent, *signals: int) -> None:
+    """A run that gets signals at its 10th update."""
 
-    def __init__(self, tick: int, *signals: int) -> None:
-        super().__init__()
-        self.left, self.signals = tick, signals
-
-    def tick(self, *about: Any) -> None:
-        self.left -= 1
-        if self.left == 0:
-            for number in self.signals:
+    def send(event: Any) -> None:
+        if event.steps == 10 * 32:
+            for number in signals:
                 os.kill(os.getpid(), number)
 
-
-def interrupted(path: Path, declared: Any, *signals: int) -> None:
-    """A run that gets signals at its 10th tick."""
-    from skillweave.hierarchy import training
-    from skillweave.training.stage import assign_workers
-
-    content = declared.manifest(3, REPORTED)
-    assign_workers(content.stages, declared.spec)
-    run = RunDirectory.create(path, content)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            training.train(declared, run, (Interrupt(10, *signals),))
-    finally:
-        run.close()
+    with pytest.raises(KeyboardInterrupt):
+        declared.train(path, seed=3, callback=send)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_saves_the_round_that_was_begun_and_loses_nothing(
-    number: int, tmp_path: Path, whole: Whole, capsys: pytest.CaptureFixture[str]
-) -> None:
+    number, tmp_path, whole, capsys
+):
     # Ray, where a test before used it, handles SIGTERM by itself.
     signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     before = signal.getsignal(number)
@@ -285,12 +259,12 @@ def test_an_interrupt_saves_the_round_that_was_begun_and_loses_nothing(
     assert_same(tmp_path / "run", reference)
 
 
-def test_a_second_interrupt_stops_at_once(tmp_path: Path) -> None:
+def test_a_second_interrupt_stops_at_once(tmp_path):
     interrupted(tmp_path / "run", KINDS["plain, ppo"](), signal.SIGINT, signal.SIGINT)
     assert not (tmp_path / "run" / "checkpoint.safetensors").exists()
 
 
-def test_a_program_that_handles_ctrl_c_itself_keeps_its_handler() -> None:
+def test_a_program_that_handles_ctrl_c_itself_keeps_its_handler():
     def own(*_: Any) -> None: ...
 
     before = signal.signal(signal.SIGINT, own)

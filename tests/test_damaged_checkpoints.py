@@ -38,16 +38,8 @@ def stopped(tmp_path_factory):
     return of
 
 
-def infinite(x):
-    return torch.full_like(x, torch.inf)
-
-
-def missing(x):
-    return None
-
-
 DAMAGES = {
-    "infinite": infinite,
+    "infinite": lambda x: torch.full_like(x, torch.inf),
     "NaN": lambda x: torch.full_like(x, torch.nan),
     "nobody": lambda x: torch.full_like(x, -1),
     "nothing but 0": torch.zeros_like,
@@ -59,7 +51,7 @@ DAMAGES = {
     "one more axis": lambda x: x[..., None].contiguous(),
     "flat": lambda x: x.flatten(),
     "empty": lambda x: x.flatten()[:0],
-    "missing": missing,
+    "missing": lambda _: None,
     "short of a row": lambda x: x[:, :-1].contiguous(),
     "one more": lambda x: x + torch.arange(len(x)),
 }

@@ -243,12 +243,10 @@ def test_it_is_said_once_that_an_environment_draws_from_them(name, workers, tmp_
     assert (f"Drawing draws from {name}," in said) == (name != "none")
 
 
-class Left(sw.Skill):
-    name = "left"
+class Left(sw.Skill): ...
 
 
-class Right(sw.Skill):
-    name = "right"
+class Right(sw.Skill): ...
 
 
 @pytest.mark.parametrize("learn", ["together", "apart", "flat"])

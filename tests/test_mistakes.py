@@ -405,7 +405,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("kind", "label"), [(kind, label) for kind, made in MISTAKES.items() for label in made]
 )
-def test_a_mistake_is_an_error_that_names_the_thing(kind: str, label: str) -> None:
+def test_a_mistake_is_an_error_that_names_the_thing(kind, label):
     mistake, words = MISTAKES[kind][label]
     assert_refused(KINDS[kind], words, mistake)
 
@@ -414,7 +414,7 @@ def test_a_mistake_is_an_error_that_names_the_thing(kind: str, label: str) -> No
     ("method", "function", "words"),
     [(method, *wrong) for method, tried in METHODS.items() for wrong in tried],
 )
-def test_a_method_that_is_wrong_is_an_error_that_names_the_thing(method, function, words) -> None:
+def test_a_method_that_is_wrong_is_an_error_that_names_the_thing(method, function, words):
     assert_refused(SkillError, words, lambda: with_skill(**{method: function}))
 
 
@@ -444,7 +444,7 @@ CHANGED = {
 
 
 @pytest.mark.parametrize("name", CHANGED)
-def test_what_is_set_after_the_declaration_is_checked_as_well(name: str) -> None:
+def test_what_is_set_after_the_declaration_is_checked_as_well(name):
     value, words = CHANGED[name]
     with pytest.raises(SkillweaveError) as caught:
         changed(**{name: value})
@@ -452,9 +452,9 @@ def test_what_is_set_after_the_declaration_is_checked_as_well(name: str) -> None
     assert not Path("runs/changed").exists()
 
 
-def test_what_is_set_on_an_agent_or_a_skill_afterwards_is_checked_as_well() -> None:
+def test_what_is_set_on_an_agent_or_a_skill_afterwards_is_checked_as_well():
     agent = sw.Agent("CartPole-v1", SMALL, 256)
-    agent.steps = "many"  # type: ignore[assignment]
+    agent.steps = "many"
     with pytest.raises(SkillweaveError, match="steps is 'many'"):
         agent.train("runs/agent", quiet=True)
     hierarchy = declare()
@@ -463,7 +463,7 @@ def test_what_is_set_on_an_agent_or_a_skill_afterwards_is_checked_as_well() -> N
         hierarchy.train("runs/changed", quiet=True)
 
 
-def test_what_is_set_on_a_hierarchy_inside_afterwards_is_checked_as_well() -> None:
+def test_what_is_set_on_a_hierarchy_inside_afterwards_is_checked_as_well():
     inner = declare()
     outer = declare(skills=[inner, Good()])
     inner.call_steps = 0
@@ -480,20 +480,20 @@ WARNED = {
 
 
 @pytest.mark.parametrize("name", WARNED)
-def test_a_misspelt_attribute_of_a_skill_is_a_warning(name: str) -> None:
+def test_a_misspelt_attribute_of_a_skill_is_a_warning(name):
     members, meant = WARNED[name]
     with pytest.warns(UserWarning, match=f"has '{name}', .* is '{meant}' meant"):
         declare(skills=[skill(**members)])
 
 
-def test_a_misspelt_attribute_of_a_skills_instance_is_a_warning() -> None:
+def test_a_misspelt_attribute_of_a_skills_instance_is_a_warning():
     mine = Good()
     mine.max_step = 5
     with pytest.warns(UserWarning, match="has 'max_step', .* is 'max_steps' meant"):
         declare(skills=[mine])
 
 
-def test_names_that_a_skills_methods_use_are_its_own() -> None:
+def test_names_that_a_skills_methods_use_are_its_own():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         declare(
@@ -533,26 +533,26 @@ LEGAL = {
 
 @pytest.mark.filterwarnings("ignore:The given NumPy array is not writable")
 @pytest.mark.parametrize("label", LEGAL)
-def test_unusual_but_legal_ways_work(label: str) -> None:
+def test_unusual_but_legal_ways_work(label):
     assert with_skill(**LEGAL[label]).path.is_dir()
 
 
-def test_training_without_a_directory_is_either_refused_or_makes_one() -> None:
+def test_training_without_a_directory_is_either_refused_or_makes_one():
     # Which of both depends on the signature of train().
     optional = inspect.signature(sw.Hierarchy.train).parameters["run_dir"].default is None
     with nullcontext() if optional else pytest.raises(SkillweaveError, match="needs run_dir"):
         assert declare().train(quiet=True).path.is_dir()
 
 
-def test_a_resumed_run_goes_on_with_its_own_settings(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_resumed_run_goes_on_with_its_own_settings(capsys):
     trained()
     declare(call_steps=7).resume("runs/ok")
     assert "call_steps is 40 (declared now: 7)" in capsys.readouterr().err
 
 
 def test_looking_for_a_forgotten_axis_does_not_change_training(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     def weights(run_dir: str) -> dict[str, Any]:
         np.random.seed(0)  # noqa: NPY002
         declare(skills=[Draws()]).train(run_dir, quiet=True)

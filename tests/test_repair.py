@@ -153,7 +153,7 @@ def weights(run: Run) -> dict[str, Any]:
     return {k: v.tolist() for k, v in run.policy.skills.policies[0].weights.items()}
 
 
-def test_a_skill_learns_to_go_on_from_where_the_other_ends(run: Run, tmp_path: Path) -> None:
+def test_a_skill_learns_to_go_on_from_where_the_other_ends(run, tmp_path):
     new = repaired(run, tmp_path / "new")
     (result,) = new.repairs
     assert result.before.of("press", "flip")[0] < 0.2
@@ -181,8 +181,8 @@ def test_a_skill_learns_to_go_on_from_where_the_other_ends(run: Run, tmp_path: P
 @pytest.mark.slow
 @pytest.mark.parametrize("rehearses", [True, False])
 def test_a_repaired_skill_keeps_its_other_starts_by_rehearsal(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rehearses: bool
-) -> None:
+    run, tmp_path, monkeypatch, rehearses
+):
     # All episodes start after the other skill, so nothing else keeps what was learnt at the start.
     monkeypatch.setattr(repair, "REHEARSED_SHARE", 1.0)
     if not rehearses:
@@ -194,7 +194,7 @@ def test_a_repaired_skill_keeps_its_other_starts_by_rehearsal(
     assert kept > 0.9 if rehearses else kept < 0.5
 
 
-def test_observations_of_done_calls_are_rehearsed(run: Run) -> None:
+def test_observations_of_done_calls_are_rehearsed(run):
     log = record_calls(SPEC, run.policy, 600, num_envs=4)
     skill = run.hierarchy.skill("press")
     obs = repair.rehearsed_obs(log, skill, None, "flip", None)
@@ -213,7 +213,7 @@ class Swapped(Press):
     name, sees = "press", (1, 0)
 
 
-def test_what_a_skill_rehearses_is_its_part(tmp_path: Path) -> None:
+def test_what_a_skill_rehearses_is_its_part(tmp_path):
     first = declare(Swapped(), Flip(), steps=512).train(tmp_path / "run", quiet=True)
     done = {"press": lambda obs: obs[:, 1] >= 0}
     log = record_calls(SPEC, first.policy, 600, num_envs=4)
@@ -256,7 +256,7 @@ def steps_to(*counts: int) -> sw.Step:
     [(Stay(), [0.5, 2.5, 2.5, 10.5]), (Press(), [2.0, 13.0, 13.0, 13.0])],
     ids=["goes on", "ends by it"],
 )
-def test_an_eager_skill_is_paid_while_its_event_holds(skill: sw.Skill, rewards: Any) -> None:
+def test_an_eager_skill_is_paid_while_its_event_holds(skill, rewards):
     holds = repair.event_of(skill, None)
     assert holds is not None
     twin = repair.eager(skill, holds, bonus=2.0, rest=10.0)
@@ -266,7 +266,7 @@ def test_an_eager_skill_is_paid_while_its_event_holds(skill: sw.Skill, rewards: 
     assert skill.defines("reward") == isinstance(skill, Press), "the skill itself stays as it is"
 
 
-def test_the_event_of_a_repair_is_the_callers_or_success() -> None:
+def test_the_event_of_a_repair_is_the_callers_or_success():
     step = steps_to(1, 3)
     for event in (held(lambda obs: obs[:, 1] == 1, 50), lambda obs: obs[:, 1] == 1):
         holds = repair.event_of(Press(), {"press": event})
@@ -277,7 +277,7 @@ def test_the_event_of_a_repair_is_the_callers_or_success() -> None:
     assert holds(step).tolist() == [False, True]
 
 
-def test_calls_of_a_repair_have_the_selectors_limit() -> None:
+def test_calls_of_a_repair_have_the_selectors_limit():
     roles = roles_of(declare(Press(), Flip(), call_steps=5))
     policies = {name: RandomChoice(3) for name in roles.skills}
     entry = RepairEntry("press", "flip", 20, [], "", Matrix([], [], [], [], []))
@@ -287,7 +287,7 @@ def test_calls_of_a_repair_have_the_selectors_limit() -> None:
     assert collector.limit == 5, "of 8 by itself"
 
 
-def test_what_is_not_better_is_not_kept(wrong: Run, tmp_path: Path) -> None:
+def test_what_is_not_better_is_not_kept(wrong, tmp_path):
     new = repaired(wrong, tmp_path / "new", **SHORT)
     (result,) = new.repairs
     assert not result.kept
@@ -296,9 +296,7 @@ def test_what_is_not_better_is_not_kept(wrong: Run, tmp_path: Path) -> None:
     assert weights(wrong) == weights(new) == weights(again)
 
 
-def test_measuring_stops_and_says_what_was_not_measured(
-    wrong: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_measuring_stops_and_says_what_was_not_measured(wrong, tmp_path, monkeypatch):
     monkeypatch.setattr(repair, "MOST_STEPS", 4_000)
     (result,) = repaired(wrong, tmp_path / "new", **SHORT | {"calls": 100_000}).repairs
     stopped = (
@@ -309,9 +307,7 @@ def test_measuring_stops_and_says_what_was_not_measured(
     assert re.search(r"so the earlier weights are kept\. " + stopped, result.sentence)
 
 
-def test_a_pair_that_is_seldom_called_is_given_up(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pair_that_is_seldom_called_is_given_up(run, tmp_path, monkeypatch):
     monkeypatch.setattr(repair, "LARGEST_CHUNK", 1_500)
     monkeypatch.setattr(repair, "FEWEST", 50_000)
     monkeypatch.setattr(repairing, "FEWEST", 50_000)
@@ -341,16 +337,14 @@ def matrix(*rows: tuple[float, float]) -> Handover:
         (((0.9, 0.85), (0.9, 0.8), (0.9, 0.9)), True, "b after a: 20%"),
     ],
 )
-def test_a_repair_is_kept_if_the_pair_is_better_and_no_other_worse(
-    later: Any, kept: bool, says: str
-) -> None:
+def test_a_repair_is_kept_if_the_pair_is_better_and_no_other_worse(later, kept, says):
     before = matrix((0.9, 0.9), (0.9, 0.2), (0.9, 0.9))
     found, sentence = repair.verdict(before, matrix(*later), "b", "a")
     assert found == kept
     assert says in sentence
 
 
-def test_a_few_calls_suffice_to_see_that_all_is_forgotten() -> None:
+def test_a_few_calls_suffice_to_see_that_all_is_forgotten():
     before = matrix((0.9, 0.9), (0.9, 0.2), (0.9, 0.9))
     few = dataclasses.replace(before, calls=before.calls.copy(), done=before.done.copy())
     few.calls[0, 0] = few.done[0, 0] = 8
@@ -376,9 +370,7 @@ def whole(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.mark.parametrize("by", ["hierarchy", "repair"])
-def test_a_stopped_repair_ends_with_the_same_weights(
-    run: Run, whole: Run, tmp_path: Path, by: str
-) -> None:
+def test_a_stopped_repair_ends_with_the_same_weights(run, whole, tmp_path, by):
     with pytest.raises(Interrupted, match=r'run\.repair\("press", after="flip", run_dir='):
         repaired(run, tmp_path / "part", callback=stop, **SHORT)
     assert not RunDirectory.open(tmp_path / "part").finished
@@ -390,9 +382,7 @@ def test_a_stopped_repair_ends_with_the_same_weights(
     assert new.repairs[0].sentence == whole.repairs[0].sentence
 
 
-def test_a_repair_that_was_stopped_while_it_was_measured_goes_on(
-    run: Run, whole: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_repair_that_was_stopped_while_it_was_measured_goes_on(run, whole, tmp_path, monkeypatch):
     def stopped(*_: Any) -> None:
         raise KeyboardInterrupt
 
@@ -407,7 +397,7 @@ def test_a_repair_that_was_stopped_while_it_was_measured_goes_on(
     assert_same(declare().resume(tmp_path / "part", quiet=True).path, whole.path)
 
 
-def test_events_of_the_caller_judge_and_are_needed_again(run: Run, tmp_path: Path) -> None:
+def test_events_of_the_caller_judge_and_are_needed_again(run, tmp_path):
     done = {"press": lambda obs: obs[:, 1] >= 0}
     with pytest.raises(DeclarationError, match="nothing to repair"):
         repaired(run, tmp_path / "a", done=done)
@@ -421,7 +411,7 @@ def test_events_of_the_caller_judge_and_are_needed_again(run: Run, tmp_path: Pat
         repaired(run, tmp_path / "c", done={"zero": at_goal})
 
 
-def test_a_weights_file_is_repaired_and_a_repaired_run_again(run: Run, tmp_path: Path) -> None:
+def test_a_weights_file_is_repaired_and_a_repaired_run_again(run, tmp_path):
     run.save_weights(tmp_path / "buttons.safetensors")
     loaded = declare().load_weights(tmp_path / "buttons.safetensors")
     first = repaired(loaded, tmp_path / "first", **SHORT | {"steps": 256})
@@ -435,7 +425,7 @@ def test_a_weights_file_is_repaired_and_a_repaired_run_again(run: Run, tmp_path:
 
 
 @pytest.mark.slow
-def test_a_skill_of_dqn_is_repaired_too(tmp_path: Path) -> None:
+def test_a_skill_of_dqn_is_repaired_too(tmp_path):
     off = sw.DQN(
         num_envs=4, batch_size=32, learning_starts=200, buffer_size=4_000, gamma=0.9,
         learning_rate=3e-3, update_ratio=0.25, exploration_fraction=0.4,
@@ -448,7 +438,7 @@ def test_a_skill_of_dqn_is_repaired_too(tmp_path: Path) -> None:
     assert again.repairs[0].sentence == new.repairs[0].sentence
 
 
-def test_a_skill_inside_another_hierarchy_is_repaired(tmp_path: Path) -> None:
+def test_a_skill_inside_another_hierarchy_is_repaired(tmp_path):
     def nested() -> sw.Hierarchy:
         inner = declare().as_skill("inner", max_steps=60)
         outer = declare(Flip())
@@ -481,12 +471,12 @@ def test_a_skill_inside_another_hierarchy_is_repaired(tmp_path: Path) -> None:
         ({"resume": True}, "resume=True continues a repair, so name its directory"),
     ],
 )
-def test_what_cannot_be_repaired_is_said(run: Run, how: dict[str, Any], says: str) -> None:
+def test_what_cannot_be_repaired_is_said(run, how, says):
     with pytest.raises(DeclarationError, match=says):
         repaired(run, None, **how)
 
 
-def test_runs_that_cannot_be_repaired(run: Run, tmp_path: Path) -> None:
+def test_runs_that_cannot_be_repaired(run, tmp_path):
     planned = run.plan(Mission(at_goal), run.log_calls(500))
     with pytest.raises(RunError, match="was planned"):
         repaired(planned, tmp_path / "a")
@@ -502,13 +492,13 @@ def test_runs_that_cannot_be_repaired(run: Run, tmp_path: Path) -> None:
         repaired(never, tmp_path / "a", after="never")
 
 
-def test_start_calls_by_name_are_checked_and_recorded(tmp_path: Path) -> None:
+def test_start_calls_by_name_are_checked_and_recorded(tmp_path):
     with pytest.raises(DeclarationError, match="start_calls names 'flop', which is no skill here"):
         declare(apart=sw.Apart(start_calls=("flop",)))
     for wrong in ((), "flip", ("flip", 3)):
         with pytest.raises(DeclarationError, match="start_calls"):
-            sw.Apart(start_calls=wrong)  # type: ignore[arg-type]
-    apart = sw.Apart(skill_steps=1_024, start_calls=["flip"])  # type: ignore[arg-type]
+            sw.Apart(start_calls=wrong)
+    apart = sw.Apart(skill_steps=1_024, start_calls=["flip"])
     assert apart.start_calls == ("flip",)
     run = declare(apart=apart).train(tmp_path / "run", quiet=True)
     assert run.info()["hierarchy"]["start_calls"] == ["flip"]

@@ -109,8 +109,8 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Reference:
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_same_seed_gives_the_same_files_byte_by_byte_and_another_seed_other_weights(
-    tmp_path: Path, reference: Reference, engine: str
-) -> None:
+    tmp_path, reference, engine
+):
     recipe, whole = reference(engine)
     recipes.load(str(recipe)).train(tmp_path / "again", seed=3, quiet=True)
     assert_same(tmp_path / "again", whole)
@@ -121,7 +121,7 @@ def test_the_same_seed_gives_the_same_files_byte_by_byte_and_another_seed_other_
     assert all(mine[name][1] != theirs[name][1] for name in theirs)
 
 
-def test_the_recipe_is_worth_interrupting(reference: Reference) -> None:
+def test_the_recipe_is_worth_interrupting(reference):
     _, whole = reference("sync")
     found = lines(whole)
     assert {r["stage"] for r in found} == {"left", "balance", "selector"}
@@ -138,9 +138,7 @@ def test_the_recipe_is_worth_interrupting(reference: Reference) -> None:
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("tick", [1, 7, 10, 12, 15, 21, 24])
-def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(
-    tmp_path: Path, reference: Reference, engine: str, tick: int
-) -> None:
+def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, reference, engine, tick):
     recipe, whole = reference(engine)
     run = stopped_run(recipes.load(str(recipe)), tmp_path / "run", tick)
     assert not run.finished
@@ -149,7 +147,7 @@ def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(
 
 
 @pytest.mark.slow
-def test_a_flat_run_stopped_in_the_middle_ends_as_if_it_had_not_been(tmp_path: Path) -> None:
+def test_a_flat_run_stopped_in_the_middle_ends_as_if_it_had_not_been(tmp_path):
     recipe = str(write_recipe(tmp_path))
     recipes.load(recipe).train(tmp_path / "whole", seed=3, flat=True, quiet=True)
     run = stopped_run(recipes.load(recipe), tmp_path / "run", 20, flat=True)
@@ -159,8 +157,8 @@ def test_a_flat_run_stopped_in_the_middle_ends_as_if_it_had_not_been(tmp_path: P
 
 @pytest.mark.slow
 def test_a_run_with_networks_of_the_usual_size_ends_as_if_it_had_not_been_stopped(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     # Where a tensor lies in memory changes the last bit of large matrix products only.
     pytest.importorskip("Box2D")
 
@@ -181,9 +179,7 @@ def test_a_run_with_networks_of_the_usual_size_ends_as_if_it_had_not_been_stoppe
     assert_same(run.path, tmp_path / "whole")
 
 
-def test_a_run_with_a_damaged_checkpoint_goes_on_from_the_one_before(
-    tmp_path: Path, reference: Reference
-) -> None:
+def test_a_run_with_a_damaged_checkpoint_goes_on_from_the_one_before(tmp_path, reference):
     recipe, whole = reference("sync")
     path = stopped_run(recipes.load(str(recipe)), tmp_path / "run", 16).path
     assert (path / "checkpoint.previous.safetensors").exists()
@@ -195,8 +191,8 @@ def test_a_run_with_a_damaged_checkpoint_goes_on_from_the_one_before(
 
 @pytest.mark.slow
 def test_a_run_killed_between_its_last_checkpoint_and_its_policy_loses_nothing(
-    tmp_path: Path, reference: Reference, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, reference, monkeypatch
+):
     recipe, whole = reference("sync")
     path = tmp_path / "run"
 
@@ -215,7 +211,7 @@ def test_a_run_killed_between_its_last_checkpoint_and_its_policy_loses_nothing(
     assert mine.final["policy_loss"] == theirs.final["policy_loss"]
 
 
-def test_resuming_a_finished_run_changes_no_file(tmp_path: Path, reference: Reference) -> None:
+def test_resuming_a_finished_run_changes_no_file(tmp_path, reference):
     recipe, whole = reference("sync")
     shutil.copytree(whole, tmp_path / "run")
     before = {p: p.read_bytes() for p in (tmp_path / "run").rglob("*.*")}
@@ -245,9 +241,7 @@ SETTINGS = [  # a run that lost any of them would end otherwise
 
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", SETTINGS)
-def test_settings_changed_for_a_run_stay_changed_when_it_is_resumed(
-    tmp_path: Path, settings: list[str]
-) -> None:
+def test_settings_changed_for_a_run_stay_changed_when_it_is_resumed(tmp_path, settings):
     recipe = str(write_recipe(tmp_path))
 
     def changed() -> Hierarchy:
@@ -261,9 +255,7 @@ def test_settings_changed_for_a_run_stay_changed_when_it_is_resumed(
     assert_same(run.path, tmp_path / "whole")
 
 
-def test_a_run_whose_skills_have_rewards_of_their_own_is_not_resumed_without_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_whose_skills_have_rewards_of_their_own_is_not_resumed_without_them(tmp_path, capsys):
     # Acting needs none of this recipe's code, but finishing the training does.
     recipe = tmp_path / "rewards.py"
     text = RECIPE.replace(', engine="ENGINE"', "").replace("def initiation", "def _unused")
@@ -355,8 +347,8 @@ class Killer(StopAt):
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_a_run_of_any_learner_stopped_again_and_again_ends_as_if_it_had_not_been(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, learner: str, workers: int
-) -> None:
+    tmp_path, monkeypatch, learner, workers
+):
     gone_on = restored_stages(monkeypatch)
     monkeypatch.setattr(ReplayLearner, "report_every", 50)
     recipe = recipe_of(tmp_path, learner, workers)
@@ -393,9 +385,7 @@ def wait_for_lines(process: subprocess.Popen[str], run: Path, count: int) -> Non
 
 
 @pytest.mark.slow
-def test_a_run_stopped_by_ctrl_c_says_how_to_go_on_and_ends_as_if_it_had_not_been(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_stopped_by_ctrl_c_says_how_to_go_on_and_ends_as_if_it_had_not_been(tmp_path, capsys):
     recipe, run, whole = str(write_recipe(tmp_path)), tmp_path / "run", tmp_path / "whole"
     train = ["train", recipe, "--seed", "3", "--set", "skills.left.steps=3000", "--evaluate", "0"]
     with subprocess.Popen(
@@ -428,9 +418,7 @@ cp -r "$1/run" "$4/finished"
 
 
 @pytest.mark.slow
-def test_a_run_stopped_by_a_full_disk_goes_on_when_there_is_room_again(
-    tmp_path: Path, reference: Reference
-) -> None:
+def test_a_run_stopped_by_a_full_disk_goes_on_when_there_is_room_again(tmp_path, reference):
     if shutil.which("unshare") is None:
         pytest.skip("no small file system can be mounted here")
     recipe, whole = reference("sync")

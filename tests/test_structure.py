@@ -191,7 +191,7 @@ def violations(source: str, module: str, package: bool = False) -> list[str]:
         ("api.declared", "def f():\n    from skillweave import recipes"),
     ],
 )
-def test_the_search_finds_an_import_against_the_order(module: str, source: str) -> None:
+def test_the_search_finds_an_import_against_the_order(module, source):
     assert len(violations(source, module)) == 1
 
 
@@ -206,19 +206,19 @@ def test_the_search_finds_an_import_against_the_order(module: str, source: str) 
         ("ops.returns", "from skillweave._internal.seeding import Seeds"),
     ],
 )
-def test_the_search_lets_pass_what_the_order_allows(module: str, source: str) -> None:
+def test_the_search_lets_pass_what_the_order_allows(module, source):
     assert violations(source, module) == []
 
 
 # The order
 
 
-def test_every_room_has_a_row() -> None:
+def test_every_room_has_a_row():
     assert {room_of(module_of(p)) for p in MODULES} <= set(ROOMS)
     assert len(MODULES) > 30
 
 
-def test_rows_name_only_rooms_and_only_the_command_line_may_import_compat() -> None:
+def test_rows_name_only_rooms_and_only_the_command_line_may_import_compat():
     named = set().union(*ROOMS.values())
     assert named <= set(ROOMS)
     assert "__main__" not in named
@@ -226,7 +226,7 @@ def test_rows_name_only_rooms_and_only_the_command_line_may_import_compat() -> N
     assert [room for room, row in ROOMS.items() if "cli" in row] == ["__main__"]
 
 
-def test_the_order_has_no_circle_below_the_public_names() -> None:
+def test_the_order_has_no_circle_below_the_public_names():
     rooms = {k: v for k, v in ROOMS.items() if k != "skillweave"}
     while rooms:
         ready = [k for k, v in rooms.items() if not (v - {k}) & set(rooms)]
@@ -248,12 +248,12 @@ def circles(graph: dict[str, set[str]]) -> set[str]:
     return {module for module in graph if module in reached(module)}
 
 
-def test_the_search_for_circles_finds_one() -> None:
+def test_the_search_for_circles_finds_one():
     graph = {"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}, "e": set[str]()}
     assert circles(graph) == {"a", "b", "c"}
 
 
-def test_no_modules_import_one_another_also_for_types_alone() -> None:
+def test_no_modules_import_one_another_also_for_types_alone():
     graph: dict[str, set[str]] = {}
     for path in MODULES:
         module, package = module_of(path), path.name == "__init__.py"
@@ -265,12 +265,12 @@ def test_no_modules_import_one_another_also_for_types_alone() -> None:
 
 
 @pytest.mark.parametrize("path", MODULES, ids=module_of)
-def test_a_module_imports_only_what_its_row_names(path: Path) -> None:
+def test_a_module_imports_only_what_its_row_names(path):
     found = violations(path.read_text(), module_of(path), path.name == "__init__.py")
     assert found == []
 
 
-def test_settings_and_commands_need_neither_torch_nor_a_heavy_room() -> None:
+def test_settings_and_commands_need_neither_torch_nor_a_heavy_room():
     modules = [
         *(f"skillweave.{name}" for name in LEAVES),
         "skillweave",
@@ -291,7 +291,7 @@ def test_settings_and_commands_need_neither_torch_nor_a_heavy_room() -> None:
 
 
 @pytest.mark.parametrize("module", HOMES)
-def test_the_public_names_are_those_of_the_lazy_table_and_of_the_type_checker(module: str) -> None:
+def test_the_public_names_are_those_of_the_lazy_table_and_of_the_type_checker(module):
     package = ROOT.parent / module.replace(".", "/")
     file = package / "__init__.py" if package.is_dir() else package.with_suffix(".py")
     tree = ast.parse(file.read_text())
@@ -310,7 +310,7 @@ def test_the_public_names_are_those_of_the_lazy_table_and_of_the_type_checker(mo
         assert seen == HOMES[module]
 
 
-def test_every_public_name_resolves_and_no_other_does() -> None:
+def test_every_public_name_resolves_and_no_other_does():
     for module, name in PUBLIC_NAMES:
         found = getattr(import_module(module), name)
         assert found.__doc__
@@ -320,7 +320,7 @@ def test_every_public_name_resolves_and_no_other_does() -> None:
         _ = import_module("skillweave").PPPO
 
 
-def test_a_name_that_is_elsewhere_is_found_there() -> None:
+def test_a_name_that_is_elsewhere_is_found_there():
     for module, name in PUBLIC_NAMES:
         if module != "skillweave":
             with pytest.raises(AttributeError, match=f"no attribute '{name}': it is in {module}$"):
