@@ -6,13 +6,16 @@ sentence (a SkillweaveError) that names who, or do no harm. ``run_hostile`` coun
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import functools
+import shutil
 import tempfile
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -70,14 +73,18 @@ class Slope(Ramp):
     action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
 
 
-def train(folder: Path, env: Any = Ramp, skill: Skill | None = None, **declared: Any) -> None:
-    """Train a hierarchy for a few steps, and evaluate it."""
+def declare(env: Any = Ramp, **declared: Any) -> Hierarchy:
+    """A hierarchy of one plain skill that trains for a few steps."""
     how: dict[str, Any] = {
-        "algorithm": PPO_TINY, "selector": PPO_TINY, "skill_steps": STEPS, "selector_steps": STEPS,
-        "call_steps": 2,
+        "skills": [Plain()], "algorithm": PPO_TINY, "selector": PPO_TINY, "skill_steps": STEPS,
+        "selector_steps": STEPS, "call_steps": 2,
     }  # fmt: skip
-    hierarchy = Hierarchy(env, [skill or Plain()], **plainly({**how, **declared}))
-    score = hierarchy.train(folder / "run", quiet=True).evaluate(2)
+    return Hierarchy(env, **plainly(how | declared))
+
+
+def train(folder: Path, env: Any = Ramp, **declared: Any) -> None:
+    """Train a hierarchy for a few steps, and evaluate it."""
+    score = declare(env, **declared).train(folder / "run", quiet=True).evaluate(2)
     assert np.isfinite(score.mean), "something that is not finite was accepted"
 
 
@@ -227,18 +234,10 @@ def skill_cases(draw: Any) -> Case:
     label = f"{method} {(make or bad).__name__} after {after} calls"  # type: ignore[union-attr]
 
     def play(folder: Path) -> None:
-        if method == "initiation":  # so that the selector always has a choice
-            _two_skills(folder, kind())
-        else:
-            train(folder, skill=kind())
+        always = [Plain()] if method == "initiation" else []  # so that the selector has a choice
+        train(folder, skills=[*always, kind()])
 
     return Case(method, label, ("'hostile'", method), play)
-
-
-def _two_skills(folder: Path, skill: Skill) -> None:
-    how: dict[str, Any] = {"algorithm": PPO_TINY, "selector": PPO_TINY, "call_steps": 2}
-    how |= {"skill_steps": STEPS, "selector_steps": STEPS}
-    Hierarchy(Ramp, [Plain(), skill], **plainly(how)).train(folder / "run", quiet=True).evaluate(2)
 
 
 @st.composite
@@ -276,7 +275,7 @@ def policy_cases(draw: Any) -> Case:
         kind = type("Hostile", (Skill,), {"name": "hostile"})
         kind.policy = staticmethod(lambda obs: make(len(obs)))
         label = make.__name__
-    return Case("policy", label, ("'hostile'",), lambda folder: train(folder, env, kind()))
+    return Case("policy", label, ("'hostile'",), lambda folder: train(folder, env, skills=[kind()]))
 
 
 # Environments ----------------------------------------------------------------------------------
@@ -370,12 +369,7 @@ def maker_cases(draw: Any) -> Case:
 
 # Settings --------------------------------------------------------------------------------------
 
-KINDS: dict[str, tuple[Any, dict[str, Any], Any]] = {
-    "PPO": (PPO, {f.name: getattr(PPO_TINY, f.name) for f in fields(PPO)}, Ramp),
-    "DQN": (DQN, OFF, Ramp),
-    "SAC": (SAC, OFF, Slope),
-    "TD3": (TD3, OFF, Slope),
-}
+KINDS = (PPO_TINY, Ramp), (DQN(**OFF), Ramp), (SAC(**OFF), Slope), (TD3(**OFF), Slope)
 SLOW = {"threads", "compile", "update_epochs", "train_freq", "update_ratio", "policy_delay"}
 """Settings whose large values are right, and take for ever."""
 
@@ -391,35 +385,27 @@ def setting_cases(draw: Any) -> Case:
     """One setting of an algorithm or a network that is odd."""
     if draw(st.integers(0, 3)) == 0:
         kind: Any = draw(st.sampled_from((Network, CNN, RNN)))
-        base: dict[str, Any] = {}
         field = draw(st.sampled_from([f.name for f in fields(kind)]))
         value = draw(
             st.one_of(_values(), _values().map(lambda v: (v,)), _values().map(lambda v: (4, v)))
         )
 
-        def network(made: Any) -> Network:
-            return Network((4,), **({} if kind is Network else {kind.__name__.lower(): made}))
-
         def play(folder: Path) -> None:
             made = kind(**{field: value})
-            train(
-                folder,
-                algorithm=PPO(
-                    **{**KINDS["PPO"][1], "network": made if kind is Network else network(made)}
-                ),
-            )
+            if kind is not Network:
+                made = Network((4,), **{kind.__name__.lower(): made})
+            train(folder, algorithm=replace(PPO_TINY, network=made))
 
         return Case("network", f"{kind.__name__}.{field} {_const(value).__name__}", (field,), play)
-    name = draw(st.sampled_from(sorted(KINDS)))
-    kind, base, env = KINDS[name]
-    field = draw(st.sampled_from([f.name for f in fields(kind) if f.name != "compile"]))
+    usual, env = draw(st.sampled_from(KINDS))
+    field = draw(st.sampled_from([f.name for f in fields(usual) if f.name != "compile"]))
     value = draw(_values(field in SLOW))
-    return Case(
-        "setting",
-        f"{name}.{field} {_const(value).__name__}",
-        (field,),
-        lambda folder: train(folder, env, algorithm=kind(**{**base, field: value})),
-    )
+    label = f"{type(usual).__name__}.{field} {_const(value).__name__}"
+
+    def train_with(folder: Path) -> None:
+        train(folder, env, algorithm=replace(usual, **{field: value}))
+
+    return Case("setting", label, (field,), train_with)
 
 
 DECLARED = (
@@ -459,39 +445,24 @@ def declared_cases(draw: Any) -> Case:
     label = _const(value).__name__
     if draw(st.booleans()):
         field = draw(st.sampled_from(DECLARED))
+        declared = {"eval_every": STEPS, "eval_episodes": 1, field: value}
         return Case(
             "declaration", f"{field} {label}", (field.rstrip("s"),),
-            lambda folder: _declared(folder, field, value),
+            lambda folder: train(folder, **declared),
         )  # fmt: skip
     field = draw(st.sampled_from(ATTRIBUTES))
     kind = type("Hostile", (Skill,), {field: value})
     return Case(
-        "attribute", f"{field} {label}", (field,), lambda folder: train(folder, skill=kind())
+        "attribute", f"{field} {label}", (field,), lambda folder: train(folder, skills=[kind()])
     )
 
 
-def _declared(folder: Path, field: str, value: Any) -> None:
-    how: dict[str, Any] = {
-        "skills": [Plain()], "algorithm": PPO_TINY, "selector": PPO_TINY, "skill_steps": STEPS,
-        "selector_steps": STEPS, "call_steps": 2, "eval_every": STEPS, "eval_episodes": 1,
-    }  # fmt: skip
-    Hierarchy(Ramp, **plainly({**how, field: value})).train(folder / "run", quiet=True).evaluate(1)
-
-
-_TRAINED: list[Any] = []
-
-
+@functools.cache
 def _trained() -> Any:
     """A run that all share who only look at it."""
-    if not _TRAINED:
-        folder = tempfile.TemporaryDirectory()
-        how: dict[str, Any] = {"algorithm": PPO_TINY, "selector": PPO_TINY, "call_steps": 2}
-        how |= {"skill_steps": STEPS, "selector_steps": STEPS}
-        run = Hierarchy(Ramp, [Plain()], **plainly(how)).train(
-            Path(folder.name) / "run", quiet=True
-        )
-        _TRAINED[:] = [run, folder]
-    return _TRAINED[0]
+    folder = tempfile.mkdtemp()
+    atexit.register(shutil.rmtree, folder)
+    return declare().train(Path(folder) / "run", quiet=True)
 
 
 CALLS = {
@@ -515,12 +486,9 @@ def call_cases(draw: Any) -> Case:
     def play(folder: Path) -> None:
         run = _trained()
         if call == "train":
-            how: dict[str, Any] = {"algorithm": PPO_TINY, "selector": PPO_TINY, "call_steps": 2}
-            how |= {"skill_steps": STEPS, "selector_steps": STEPS}
-            hierarchy = Hierarchy(Ramp, [Plain()], **plainly(how))
             given = {"run_dir": folder / "run", "quiet": True, field: value}
             with contextlib.chdir(folder):
-                hierarchy.train(given.pop("run_dir"), **given)
+                declare().train(given.pop("run_dir"), **given)
         elif call in ("load", "load_weights"):
             with contextlib.chdir(folder):
                 getattr(run.hierarchy, call)(value)
@@ -584,9 +552,3 @@ def run_hostile(
 
     each()
     return counts
-
-
-def outcomes(counts: Counter[tuple[str, str]]) -> Iterator[str]:
-    """The table as lines."""
-    for (category, outcome), count in sorted(counts.items()):
-        yield f"{category:12} {outcome:10} {count:6}"

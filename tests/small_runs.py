@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -107,25 +107,17 @@ class Heard:
         self.said.append(text)
 
 
-class StopAt:
+class StopAt(Heard):
     """A listener that raises at its n-th tick."""
 
     def __init__(self, tick: int) -> None:
+        super().__init__()
         self.left = tick
 
-    def stage(self, name: str, budget: int) -> None:
-        pass
-
-    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+    def tick(self, *told: Any) -> None:
         self.left -= 1
         if self.left == 0:
             raise Stopped
-
-    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        pass
-
-    def message(self, text: str) -> None:
-        pass
 
 
 def policies(run: Path) -> dict[str, tuple[dict[str, Any], bytes]]:
@@ -183,6 +175,14 @@ def new_run(hierarchy: Hierarchy, path: Path, **options: Any) -> RunDirectory:
     content = training.manifest(hierarchy, **{"seed": 3, "flat": False} | options)
     assign_workers(content.stages, hierarchy.spec)
     return RunDirectory.create(path, content)
+
+
+def messages(hierarchy: Hierarchy, path: Path, *listeners: Any) -> list[str]:
+    """What a listener of a new run hears until its training ends."""
+    heard, run = Heard(), new_run(hierarchy, path)
+    with closing(run):
+        training.train(hierarchy, run, (heard, *listeners))
+    return heard.said
 
 
 def stopped_run(hierarchy: Hierarchy, path: Path, tick: int, **options: Any) -> RunDirectory:
@@ -262,21 +262,28 @@ def stop_at(steps: int, stage: str = "agent") -> Callable[[Any], None]:
     return stop
 
 
-Kinds = Mapping[str, Callable[[], Hierarchy]]
+Kinds = Mapping[str, Callable[[], Any]]
 
 
 class Whole:
-    """An uninterrupted run of each kind of hierarchy, made once."""
+    """An uninterrupted run of each kind of declaration, made once.
 
-    def __init__(self, kinds: Kinds, tmp_path_factory: pytest.TempPathFactory) -> None:
-        self.kinds, self._folders = kinds, tmp_path_factory
+    Args:
+        how: further arguments of ``train``.
+    """
+
+    def __init__(self, kinds: Kinds, tmp_path_factory: pytest.TempPathFactory, **how: Any) -> None:
+        self.kinds, self._folders, self._how = kinds, tmp_path_factory, how
         self._made: dict[str, tuple[Run, Path]] = {}
 
     def __call__(self, kind: str) -> tuple[Run, Path]:
         if kind not in self._made:
             path = self._folders.mktemp("whole") / "run"
-            self._made[kind] = self.kinds[kind]().train(path, seed=3, quiet=True), path
+            self._made[kind] = self.train(kind, path), path
         return self._made[kind]
+
+    def train(self, kind: str, path: Path) -> Run:
+        return self.kinds[kind]().train(path, seed=3, quiet=True, **self._how)
 
     def assert_resumes(self, kind: str, ticks: tuple[int, ...], path: Path) -> None:
         """A run that is stopped, and resumed, again and again, ends as if it had not been.

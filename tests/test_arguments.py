@@ -103,26 +103,26 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
 
 
 @pytest.mark.parametrize(("call", "words"), WRONG, ids=[words[:60] for _, words in WRONG])
-def test_the_message_says_what_is_meant(call: Callable[[], Any], words: str) -> None:
+def test_the_message_says_what_is_meant(call, words):
     with pytest.raises(DeclarationError) as caught:
         call()
     assert words in str(caught.value)
 
 
-def test_what_is_right_stays_as_it_was() -> None:
+def test_what_is_right_stays_as_it_was():
     made = plan(call_steps=5)
     made.call_steps, made.recipe = 6, "mine"
-    made._cached = 1  # type: ignore[attr-defined]
+    made._cached = 1
     assert made.train("runs") == "runs"
     assert (made.call_steps, made.recipe) == (6, "mine")
 
 
-def test_a_type_error_of_the_body_is_not_hidden() -> None:
+def test_a_type_error_of_the_body_is_not_hidden():
     with pytest.raises(TypeError, match="has no len"):
         plan().fail(5)
 
 
-def test_a_subclass_of_a_user_may_have_attributes_of_its_own() -> None:
+def test_a_subclass_of_a_user_may_have_attributes_of_its_own():
     class Mine(Plan):
         def __init__(self) -> None:
             super().__init__("CartPole-v1", ["left"])
@@ -130,11 +130,11 @@ def test_a_subclass_of_a_user_may_have_attributes_of_its_own() -> None:
 
     assert Mine().notes == "mine"
     with pytest.raises(DeclarationError, match="is 'skills' meant"):
-        Mine().skils = []  # type: ignore[attr-defined]
+        Mine().skils = []
 
 
 @pytest.mark.parametrize("config", [sw.PPO(gamma=0.5), sw.SAC(), sw.Network((8,)), sw.EnvSpec("a")])
-def test_settings_are_copied_and_described_as_before(config: Any) -> None:
+def test_settings_are_copied_and_described_as_before(config):
     kind = type(config)
     assert pickle.loads(pickle.dumps(config)) == config
     assert copy.deepcopy(config) == config == dataclasses.replace(config)
@@ -155,13 +155,13 @@ CALLED = [(m, name) for m, homes in HOMES.items() for name in homes if name not 
 
 
 @pytest.mark.parametrize(("module", "name"), CALLED)
-def test_every_public_name_refuses_an_unknown_argument(module: str, name: str) -> None:
+def test_every_public_name_refuses_an_unknown_argument(module, name):
     with pytest.raises(DeclarationError, match=r"no (setting|argument) 'quxx'|needs "):
         getattr(import_module(module), name)(quxx=1)
 
 
 @pytest.mark.parametrize("name", [n for n in vars(sw.Run) if not n.startswith("_")])
-def test_every_method_of_a_run_refuses_an_unknown_argument(name: str) -> None:
+def test_every_method_of_a_run_refuses_an_unknown_argument(name):
     method = vars(sw.Run)[name]
     if isinstance(method, property):
         return

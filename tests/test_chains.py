@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from ready_selectors.chain import DOOR, KEY, SPEC, GetKey, Leave, got_key
-from small_runs import ON, Heard, StopAt, Stopped, assert_same, new_run
+from small_runs import ON, Heard, assert_same, messages, new_run, stopped_run
 from test_together import declare
 
 from skillweave import Automaton, SkillweaveError, Together
@@ -55,13 +55,10 @@ def test_a_skill_that_nobody_leads_to_is_told_with_who_was_tried(tmp_path, monke
 
 
 def test_a_skill_that_found_no_start_in_all_its_steps_is_told_in_the_end(tmp_path):
-    heard = Heard()
     hierarchy = chain(GetKey(), Beyond(), Unlock(), learn="apart", skill_steps=300)
     hierarchy.apart = replace(hierarchy.apart, selector_steps=300)
-    run = new_run(hierarchy, tmp_path / "run")
-    training.train(hierarchy, run, (heard,))
-    run.close()
-    (said,) = [text for text in heard.said if "learnt nothing" in text]
+    heard = messages(hierarchy, tmp_path / "run")
+    (said,) = [text for text in heard if "learnt nothing" in text]
     assert said.startswith("beyond: it learnt nothing in 3"), said
 
 
@@ -104,43 +101,34 @@ def never(selector=None):
 
 
 def test_a_skill_that_was_never_called_is_told_in_the_end_also_after_a_stop(tmp_path):
-    heard, again = Heard(), Heard()
-    whole = new_run(never(), tmp_path / "whole")
-    training.train(never(), whole, (heard,))
-    whole.close()
-    early = [text for text in heard.said if "was not called in the first" in text]
+    again = Heard()
+    heard = messages(never(), tmp_path / "whole")
+    early = [text for text in heard if "was not called in the first" in text]
     assert early[0].startswith("together: skill 'beyond' was not called in the first 1")
-    (said,) = [text for text in heard.said if "never called" in text]
+    (said,) = [text for text in heard if "never called" in text]
     assert said.startswith("together: skill 'beyond' was never called in 5")
-    run = new_run(never(), tmp_path / "run")
-    with pytest.raises(Stopped):
-        training.train(never(), run, (StopAt(4),))
+    run = stopped_run(never(), tmp_path / "run", 4)
     training.train(never(), run, (again,))
-    run.close()
     assert [text for text in again.said if "never called" in text] == [said]
-    assert_same(run.path, whole.path)
+    assert_same(run.path, tmp_path / "whole")
 
 
 def test_a_skill_that_acted_too_seldom_to_learn_is_told(tmp_path):
-    heard = Heard()
     often = replace(ON, learning_rate=1e-5)
     few = chain(
         GetKey(), Unlock(), Leave(), selector=often,
         together=Together(quota=1.0, epsilon=0.0, task_weight=0.0),
         together_steps=70,
     )  # fmt: skip
-    run = new_run(few, tmp_path / "run")
-    training.train(few, run, (heard,))
-    run.close()
-    assert any("'unlock'" in text and "quota" in text for text in heard.said), heard.said
+    heard = messages(few, tmp_path / "run")
+    assert any("'unlock'" in text and "quota" in text for text in heard), heard
 
 
 def test_a_run_killed_right_after_its_last_checkpoint_says_what_it_would_have_said(
     tmp_path, monkeypatch
 ):
-    heard, again = Heard(), Heard()
-    whole, run = new_run(never(), tmp_path / "whole"), new_run(never(), tmp_path / "run")
-    training.train(never(), whole, (heard,))
+    again, run = Heard(), new_run(never(), tmp_path / "run")
+    heard = messages(never(), tmp_path / "whole")
 
     def killed(*told):
         raise KeyboardInterrupt
@@ -150,8 +138,7 @@ def test_a_run_killed_right_after_its_last_checkpoint_says_what_it_would_have_sa
         with pytest.raises(KeyboardInterrupt):
             training.train(never(), run)
     training.train(never(), run, (again,))
-    later = [text for text in heard.said if "was not called in the first" not in text]
+    later = [text for text in heard if "was not called in the first" not in text]
     assert again.said == later, "what is said early was said"
-    assert_same(run.path, whole.path)
-    for each in (run, whole):
-        each.close()
+    assert_same(run.path, tmp_path / "whole")
+    run.close()

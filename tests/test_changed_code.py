@@ -143,14 +143,14 @@ EDITS = {
 
 
 @pytest.mark.parametrize("what", EDITS)
-def test_an_edit_is_named_if_it_changes_what_happens(edited: Any, what: str) -> None:
+def test_an_edit_is_named_if_it_changes_what_happens(edited, what):
     before = texts(edited())
     for edit in EDITS[what]:
         says = changes(before, texts(edited(*edit)))
         assert (says.count("has changed") == 1 and what in says) if what else not says, edit
 
 
-def test_values_in_closures_and_arguments_of_wrappers_count(edited: Any) -> None:
+def test_values_in_closures_and_arguments_of_wrappers_count(edited):
     own, limit = edited(), gym.wrappers.TimeLimit
     assert "the reward" in changes(texts(own), texts(own, -1))
     assert "kwargs" in changes(texts(own), texts(own, kwargs={"gain": 2}))
@@ -164,14 +164,14 @@ def test_values_in_closures_and_arguments_of_wrappers_count(edited: Any) -> None
         assert "wrappers" in changes(one, other)
 
 
-def test_code_that_was_made_from_text_has_no_module_and_no_sum() -> None:
+def test_code_that_was_made_from_text_has_no_module_and_no_sum():
     scope: dict[str, Any] = {}
     exec("reward = lambda step: step.reward", scope)
     assert scope["reward"].__module__ is None
     assert code_sum(scope["reward"]) == ""
 
 
-def test_use_place_and_process_change_nothing(edited: Any, tmp_path: Path) -> None:
+def test_use_place_and_process_change_nothing(edited, tmp_path):
     own = edited()
     before = texts(own)
     own.Room().reset(seed=1)
@@ -226,9 +226,7 @@ def run(edited: Any, tmp_path: Path) -> sw.Run:
 
 
 @pytest.mark.parametrize("use", USES)
-def test_each_use_says_once_that_the_environment_has_changed(
-    edited: Any, run: sw.Run, use: str, capfd: Any
-) -> None:
+def test_each_use_says_once_that_the_environment_has_changed(edited, run, use, capfd):
     for edit, times in ((("GAIN *", "GAIN -"), 1), (("A room.", "My room."), 0)):
         with warnings.catch_warnings(record=True) as given:
             warnings.simplefilter("default")
@@ -238,7 +236,7 @@ def test_each_use_says_once_that_the_environment_has_changed(
 
 
 @pytest.mark.filterwarnings("ignore:the .* of skill .* has changed since .* trained")
-def test_a_log_is_refused_where_calls_would_end_elsewhere(edited: Any, run: sw.Run) -> None:
+def test_a_log_is_refused_where_calls_would_end_elsewhere(edited, run):
     def skills(*edit: str) -> Any:
         policy: Any = declare(edited(*edit)).load(run.path).policy
         return policy.skills
@@ -248,7 +246,7 @@ def test_a_log_is_refused_where_calls_would_end_elsewhere(edited: Any, run: sw.R
         used_log(run).check_skills(skills("> 9", "> 8"))
 
 
-def test_a_run_that_goes_on_with_another_reward_says_so_once(edited: Any, tmp_path: Path) -> None:
+def test_a_run_that_goes_on_with_another_reward_says_so_once(edited, tmp_path):
     def learning(steps: int, far: float) -> sw.Hierarchy:
         own = edited("    @staticmethod\n        def policy", "    def unused")
         skills = [own.skill(1), own.skill(-1)]
@@ -266,7 +264,7 @@ def test_a_run_that_goes_on_with_another_reward_says_so_once(edited: Any, tmp_pa
 
 
 @pytest.mark.filterwarnings("ignore:the code of the environment has changed since .* trained")
-def test_logs_of_two_environments_are_not_mixed(edited: Any, run: sw.Run) -> None:
+def test_logs_of_two_environments_are_not_mixed(edited, run):
     now = declare(edited("GAIN *", "GAIN -")).load(run.path)
     with pytest.warns(UserWarning, match=r"They are now in calls-1\.safetensors"):
         new = now.log_calls(100)

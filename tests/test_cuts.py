@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -15,9 +12,33 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_runs import MEMORY, OFF, ON, Balance, Left, Push, assert_same, plain_recipe
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
+from small_runs import (
+    MEMORY,
+    OFF,
+    ON,
+    Balance,
+    Left,
+    Push,
+    Whole,
+    assert_same,
+    lines,
+    policies,
+)
+from toys import REALS, World
 
-from skillweave import DQN, SAC, Agent, Apart, EnvSpec, Hierarchy, Network, Together, TrainDefaults
+from skillweave import (
+    DQN,
+    SAC,
+    TD3,
+    Agent,
+    Apart,
+    EnvSpec,
+    Hierarchy,
+    Network,
+    Together,
+    TrainDefaults,
+)
 from skillweave._internal import interrupts
 from skillweave.evolution import Evolution
 from skillweave.runs.directory import RunDirectory
@@ -28,21 +49,21 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
 SYNC = EnvSpec("CartPole-v1", engine="sync", workers=1)
 STEPS = 1_600
 SELDOM = TrainDefaults(checkpoint_every=10**9)
-REPORTED = {"checkpoint_every": 10**9, "eval_every": 300, "eval_episodes": 2}
-BOX = SAC(
-    num_envs=4,
-    batch_size=8,
-    learning_starts=40,
-    buffer_size=500,
-    update_ratio=0.1,
-    normalize_rewards=True,
-    network=Network((8,)),
-)
+REPORTED = replace(SELDOM, eval_every=300, eval_episodes=2)
+REPLAY: dict[str, Any] = {
+    "num_envs": 4, "batch_size": 8, "learning_starts": 40, "buffer_size": 500, "update_ratio": 0.1,
+    "network": Network((8,)), "normalize_rewards": True,
+}  # fmt: skip
 
 
 def plain(algorithm: Any, env: Any = "CartPole-v1", steps: int = STEPS) -> Callable[[], Agent]:
     """A declaration of a plain agent."""
-    return lambda: Agent(env, algorithm, steps)
+    return lambda: Agent(env, algorithm, steps, train_defaults=REPORTED)
+
+
+def in_a_pool() -> Agent:
+    pytest.importorskip("envpool")
+    return plain(ON, EnvSpec("CartPole-v1", engine="envpool", workers=1))()
 
 
 def skills(learn: str, algorithm: Any = ON, **how: Any) -> Callable[[], Hierarchy]:
@@ -67,45 +88,32 @@ def skills(learn: str, algorithm: Any = ON, **how: Any) -> Callable[[], Hierarch
     return declare
 
 
-def nested() -> Hierarchy:
-    """A hierarchy in which a skill is one."""
-    inner = Hierarchy(
-        SYNC,
-        [Left(), Push()],
-        algorithm=ON,
-        selector=ON,
-        call_steps=3,
-        name="inner",
-        train_defaults=SELDOM,
-    )
-    return Hierarchy(
-        SYNC,
-        [inner.as_skill("inner"), Balance()],
-        algorithm=ON,
-        selector=ON,
-        call_steps=8,
-        learn="together",
-        together=Together(steps=800),
-        train_defaults=SELDOM,
-    )
+NOW = "plain, ppo without overlap"
+PARTS = Dict(picture=Box(0, 255, (6, 8, 1), np.uint8), number=Box(-1, 1, (1,), np.float32))
+PAIR = Tuple((Discrete(2), Box(-1, 1, (1,), np.float32)))
 
 
 KINDS: dict[str, Callable[[], Any]] = {
     "plain, ppo": plain(ON, SYNC),
-    "plain, ppo without overlap": plain(replace(ON, overlap=False), SYNC),
+    NOW: plain(replace(ON, overlap=False), SYNC),
     "plain, recurrent ppo": plain(MEMORY, SYNC),
-    "plain, in a pool": plain(ON, EnvSpec("CartPole-v1", engine="envpool", workers=1)),
+    "plain, in a pool": in_a_pool,
     "plain, dqn": plain(OFF, SYNC),
     "plain, dqn beside collecting": plain(replace(OFF, overlap=True), SYNC),
     "plain, rainbow": plain(DQN.rainbow(**{**vars(OFF), "n_step": 3, "overlap": True}), SYNC),
-    "plain, sac beside collecting": plain(replace(BOX, overlap=True), "Pendulum-v1", 800),
+    "plain, sac beside collecting": plain(SAC(**REPLAY, overlap=True), "Pendulum-v1", 800),
+    "plain, td3": plain(TD3(**REPLAY, normalize_obs=True), "Pendulum-v1", 800),
+    "plain, dqn in parts": plain(DQN(**REPLAY), lambda: World(PARTS), 800),
+    "plain, sac in a tuple": plain(
+        SAC(**REPLAY, normalize_obs=True), lambda: World(PAIR, REALS), 800
+    ),
+    "plain, sac of choices": plain(SAC(**REPLAY), lambda: World(PARTS["picture"]), 800),
     "plain, in two processes": plain(ON, replace(SYNC, workers=2)),
     "apart": skills("apart"),
     "apart, from replay": skills("apart", OFF),
     "together": skills("together"),
     "together, from replay": skills("together", replace(OFF, overlap=True)),
     "apart, then together": skills("apart, then together"),
-    "nested": nested,
 }
 POPULATIONS: dict[str, Callable[[], Any]] = {
     "a population": plain(ON, SYNC, 2_000),
@@ -114,27 +122,10 @@ POPULATIONS: dict[str, Callable[[], Any]] = {
 }
 
 
-def train(declared: Any, path: Path, evolves: bool = False) -> None:
-    how: dict[str, Any] = {"evolve": Evolution(2, 3, 2)} if evolves else {}
-    how |= REPORTED if isinstance(declared, Agent) else {}
-    declared.train(path, seed=3, quiet=True, **how)
-
-
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """A run of each kind in which no checkpoint was written, made once."""
-    made: dict[str, Path] = {}
-
-    def make(kind: str) -> Path:
-        if kind == "plain, in a pool":
-            pytest.importorskip("envpool")
-        if kind not in made:
-            made[kind] = tmp_path_factory.mktemp("whole") / "run"
-            evolves = kind in POPULATIONS
-            train((KINDS | POPULATIONS)[kind](), made[kind], evolves)
-        return made[kind]
-
-    return make
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    """Runs in which no checkpoint was written."""
+    return Whole(KINDS, tmp_path_factory)
 
 
 @contextmanager
@@ -161,22 +152,18 @@ def at_random_places(share: float, seed: int, stop_after: int | None = None) -> 
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", KINDS)
-def test_checkpoints_at_twenty_random_places_change_no_weight_and_no_report(
-    kind: str, tmp_path: Path, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reference = whole(kind)
+def test_checkpoints_at_twenty_random_places_change_no_weight_and_no_report(kind, tmp_path, whole):
+    _, reference = whole(kind)
     with at_random_places(0.5 if kind.startswith("plain") else 0.95, 0) as places:
-        train(KINDS[kind](), tmp_path / "run")
+        whole.train(kind, tmp_path / "run")
     assert len(places) >= 20
     assert_same(tmp_path / "run", reference)
 
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_that_stops_at_checkpoints_and_goes_on_ends_as_one_without_any(
-    kind: str, tmp_path: Path, whole: Callable[[str], Path]
-) -> None:
-    reference, path, stops = whole(kind), tmp_path / "run", 0
+def test_a_run_that_stops_at_checkpoints_and_goes_on_ends_as_one_without_any(kind, tmp_path, whole):
+    (_, reference), path, stops = whole(kind), tmp_path / "run", 0
     for seed in range(100):
         # Sometimes it goes on from a checkpoint that is not the latest round's.
         with at_random_places(0.2, seed, stop_after=1 + seed % 3) as places:
@@ -184,7 +171,7 @@ def test_a_run_that_stops_at_checkpoints_and_goes_on_ends_as_one_without_any(
                 if path.exists():
                     KINDS[kind]().resume(path, quiet=True)
                 else:
-                    train(KINDS[kind](), path)
+                    whole.train(kind, path)
                 break
             except KeyboardInterrupt:
                 stops += 1
@@ -193,15 +180,20 @@ def test_a_run_that_stops_at_checkpoints_and_goes_on_ends_as_one_without_any(
     assert_same(path, reference)
 
 
+@pytest.fixture(scope="module")
+def populations(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    return Whole(POPULATIONS, tmp_path_factory, evolve=Evolution(2, 3, 2))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", POPULATIONS)
 def test_a_population_that_stops_after_generations_ends_as_one_that_does_not(
-    kind: str, tmp_path: Path, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reference, path = whole(kind), tmp_path / "run"
+    kind, tmp_path, populations, monkeypatch
+):
+    (_, reference), path = populations(kind), tmp_path / "run"
     monkeypatch.setattr(interrupts, "requested", lambda: True)
     with pytest.raises(KeyboardInterrupt):
-        train(POPULATIONS[kind](), path, evolves=True)
+        populations.train(kind, path)
     for _ in range(5):
         with suppress(KeyboardInterrupt):
             POPULATIONS[kind]().resume(path, quiet=True)
@@ -211,59 +203,52 @@ def test_a_population_that_stops_after_generations_ends_as_one_that_does_not(
     assert_same(path, reference)
 
 
-def test_a_checkpoint_is_written_when_the_latest_is_old(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.slow
+def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(tmp_path, whole):
+    sizes, (_, reference) = [], whole("plain, dqn")
+    for saved in (True, False):
+        path, agent = tmp_path / str(saved), plain(replace(OFF, save_buffer=saved), SYNC)()
+        with at_random_places(0.2, 0, stop_after=20), pytest.raises(KeyboardInterrupt):
+            agent.train(path, seed=3, quiet=True)
+        sizes.append((path / "checkpoint.safetensors").stat().st_size)
+        agent.resume(path, quiet=True)
+        for name, (_, weights) in policies(reference).items():
+            assert (policies(path)[name][1] == weights) == saved
+    assert sizes[1] < sizes[0]
+    assert [r["steps"] for r in lines(path)] == [r["steps"] for r in lines(reference)]
+
+
+def test_a_checkpoint_is_written_when_the_latest_is_old(tmp_path, monkeypatch):
     saved: list[int] = []
     monkeypatch.setattr(RunDirectory, "save_checkpoint", lambda *_: saved.append(1))
     monkeypatch.setattr("skillweave.training.loop.CHECKPOINT_SHARE", 1e9)
-    train(plain(ON, SYNC)(), tmp_path / "young")
+    plain(ON, SYNC)().train(tmp_path / "young", quiet=True)
     assert len(saved) == 1  # the last one
     monkeypatch.setattr("skillweave.training.loop.CHECKPOINT_SECONDS", 0.0)
-    train(plain(ON, SYNC)(), tmp_path / "old")
+    plain(ON, SYNC)().train(tmp_path / "old", quiet=True)
     assert len(saved) == 1 + STEPS // 32
 
 
-class Interrupt:
-    """A listener that sends this process signals at a tick."""
+def interrupted(path: Path, declared: Agent, *signals: int) -> None:
+    """A run that gets signals at its 10th update."""
 
-    def __init__(self, tick: int, *signals: int) -> None:
-        self.left, self.signals = tick, signals
-
-    def stage(self, *about: Any) -> None: ...
-    def done(self, *about: Any) -> None: ...
-    def message(self, text: str) -> None: ...
-
-    def tick(self, *about: Any) -> None:
-        self.left -= 1
-        if self.left == 0:
-            for number in self.signals:
+    def send(event: Any) -> None:
+        if event.steps == 10 * 32:
+            for number in signals:
                 os.kill(os.getpid(), number)
 
-
-def interrupted(path: Path, declared: Any, *signals: int) -> None:
-    """A run that gets signals at its 10th tick."""
-    from skillweave.hierarchy import training
-    from skillweave.training.stage import assign_workers
-
-    content = declared.manifest(3, TrainDefaults(**REPORTED))
-    assign_workers(content.stages, declared.spec)
-    run = RunDirectory.create(path, content)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            training.train(declared, run, (Interrupt(10, *signals),))
-    finally:
-        run.close()
+    with pytest.raises(KeyboardInterrupt):
+        declared.train(path, seed=3, callback=send)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_saves_the_round_that_was_begun_and_loses_nothing(
-    number: int, tmp_path: Path, whole: Callable[[str], Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+    number, tmp_path, whole, capsys
+):
     # Ray, where a test before used it, handles SIGTERM by itself.
     signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     before = signal.getsignal(number)
-    reference, declared = whole("plain, ppo without overlap"), KINDS["plain, ppo without overlap"]()
+    (_, reference), declared = whole(NOW), KINDS[NOW]()
     interrupted(tmp_path / "run", declared, number)
     assert signal.getsignal(number) is before
     assert "stopping after this round, and saving" in capsys.readouterr().err
@@ -274,12 +259,12 @@ def test_an_interrupt_saves_the_round_that_was_begun_and_loses_nothing(
     assert_same(tmp_path / "run", reference)
 
 
-def test_a_second_interrupt_stops_at_once(tmp_path: Path) -> None:
+def test_a_second_interrupt_stops_at_once(tmp_path):
     interrupted(tmp_path / "run", KINDS["plain, ppo"](), signal.SIGINT, signal.SIGINT)
     assert not (tmp_path / "run" / "checkpoint.safetensors").exists()
 
 
-def test_a_program_that_handles_ctrl_c_itself_keeps_its_handler() -> None:
+def test_a_program_that_handles_ctrl_c_itself_keeps_its_handler():
     def own(*_: Any) -> None: ...
 
     before = signal.signal(signal.SIGINT, own)
@@ -288,21 +273,3 @@ def test_a_program_that_handles_ctrl_c_itself_keeps_its_handler() -> None:
             assert signal.getsignal(signal.SIGINT) is own
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def test_ctrl_c_in_the_command_line_saves_and_names_the_command_to_go_on(tmp_path: Path) -> None:
-    recipe, run = tmp_path / "recipe.py", tmp_path / "run"
-    recipe.write_text(plain_recipe(200_000))
-    command = [sys.executable, "-m", "skillweave", "train", str(recipe), "-o", str(run)]
-    with subprocess.Popen(
-        [*command, "--evaluate", "0"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        metrics = run / "metrics.jsonl"
-        while process.poll() is None and not (metrics.exists() and metrics.stat().st_size):
-            time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate()
-    assert process.returncode == 130
-    assert "Traceback" not in err
-    assert (run / "checkpoint.safetensors").exists()
-    assert f"Continue: skillweave resume {run} --recipe {recipe}" in err

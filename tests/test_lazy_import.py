@@ -32,7 +32,7 @@ def probe(*arguments: str) -> tuple[int, list[str]]:
 
 @pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["evaluate", "-h"]])
-def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
+def test_help_imports_nothing_heavy(arguments):
     code, heavy = probe(*arguments)
     assert code == 0
     assert heavy == []
@@ -52,20 +52,20 @@ def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
     ],
     ids=lambda arguments: " ".join(arguments) or "nothing",
 )
-def test_an_argument_error_imports_nothing_heavy(arguments: list[str]) -> None:
+def test_an_argument_error_imports_nothing_heavy(arguments):
     code, heavy = probe(*arguments)
     assert code == 2
     assert heavy == []
 
 
 @pytest.mark.slow
-def test_the_probe_sees_what_a_real_command_imports() -> None:
+def test_the_probe_sees_what_a_real_command_imports():
     code, heavy = probe("list")
     assert code == 0
     assert {"torch", "gymnasium"} <= set(heavy)
 
 
-def test_importing_the_package_imports_nothing_heavy_until_a_name_is_used() -> None:
+def test_importing_the_package_imports_nothing_heavy_until_a_name_is_used():
     code = "import sys, skillweave\n"
     code += f"print([n for n in {HEAVY!r} if n in sys.modules])\n"
     code += "skillweave.PPO\nprint('torch' in sys.modules)\n"
@@ -74,7 +74,7 @@ def test_importing_the_package_imports_nothing_heavy_until_a_name_is_used() -> N
     assert done.stdout.split("\n")[:3] == ["[]", "False", "True"]
 
 
-def test_python_itself_reports_no_import_of_torch_for_help() -> None:
+def test_python_itself_reports_no_import_of_torch_for_help():
     command = [sys.executable, "-X", "importtime", "-m", "skillweave", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     modules = {line.rsplit("|", 1)[-1].strip() for line in done.stderr.splitlines()}

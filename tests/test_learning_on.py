@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from small_runs import Left, Push, assert_same, new_run
+from small_runs import Heard, Left, Push, assert_same, new_run
 from test_together import Other, declare
 
 from skillweave import SkillweaveError
@@ -52,15 +52,11 @@ def test_the_whole_state_of_the_stage_before_is_what_it_begins_with(whole, name)
         assert float(begun[name]["return_count"][0]) > 10
 
 
-class StopAfter:
+class StopAfter(Heard):
     """A listener that raises when a stage is done."""
 
     def __init__(self, stage):
         self.at = stage
-
-    def stage(self, *told): ...
-    def tick(self, *told): ...
-    def message(self, *told): ...
 
     def done(self, name, *told):
         if name == self.at:

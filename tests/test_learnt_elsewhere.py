@@ -60,18 +60,6 @@ def test_all_settings_that_would_be_ignored_are_named():
         declare(Cloned())
 
 
-def test_what_a_ready_skill_says_of_its_calls_stays():
-    class Ready(sw.Skill):
-        policy = module()
-        max_steps = 3
-        call_steps = 2
-
-        def reward(self, step):
-            return step.reward
-
-    assert declare(Ready()).skills[0].max_steps == 3
-
-
 class Trains(sw.Skill):
     algorithm = SMALL
     steps = 16

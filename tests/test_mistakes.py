@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from toys import World
 
 import skillweave as sw
 from skillweave import recipes
-from skillweave.errors import KINDS, SkillweaveError
+from skillweave.errors import KINDS, SkillError, SkillweaveError
 from skillweave.skills.selector import FunctionSelector
 
 SMALL = sw.PPO(num_envs=4, n_steps=32, batch_size=32)
@@ -32,43 +33,30 @@ class Good(sw.Skill):
         return step.next_obs[:, 0]
 
 
-class Boom(gym.Env):
-    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(2, np.float32), {}
-
+class Boom(World):
     def step(self, action):
         raise ValueError("boom")
 
 
-class Wrong(Boom):
+class Wrong(World):
     def step(self, action):
         return np.zeros(3, np.float32), 0.0, False, False, {}
 
 
-class Old(Boom):
+class Old(World):
     def step(self, action):
         return np.zeros(2, np.float32), 0.0, False, {}
 
 
-class Forbids(Boom):
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(2, np.float32), {"action_mask": np.zeros(2, np.int8)}
+class Forbids(World):
+    def reset(self, **how):
+        return super().reset(**how)[0], {"action_mask": np.zeros(2, np.int8)}
 
 
-class Room(Boom):
-    observation_space = gym.spaces.Dict(
-        {"place": gym.spaces.Box(-1, 1, (2,)), "held": gym.spaces.Discrete(3)}
-    )
-
-    def reset(self, *, seed=None, options=None):
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        return self.observation_space.sample(), 0.0, False, False, {}
+class Room(World):
+    def __init__(self):
+        parts = {"place": gym.spaces.Box(-1, 1, (2,)), "held": gym.spaces.Discrete(3)}
+        super().__init__(gym.spaces.Dict(parts))
 
 
 KEYS = "Dict with the keys 'held', 'place'"
@@ -117,500 +105,294 @@ def file_in_the_way() -> None:
     declare().train("afile", quiet=True)
 
 
-def by_chance(**members: Any) -> sw.Run:
-    """CartPole has four numbers, and there are four environments."""
-    return with_skill(**members)
-
-
+# By chance: CartPole has four numbers, and there are four environments.
 AXIS = "the first axis of every array is that of the environments"
-MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
-    # Environments
-    "misspelt env id": (lambda: train("CartPol-v1"), "EnvError", "is 'CartPole-v1' meant?"),
-    "old env id": (lambda: train("LunarLander-v2"), "EnvError", "use `LunarLander-v3` instead"),
-    "env not imported": (
-        lambda: train("ALE/Pong-v5"),
-        "EnvError",
-        "install and import that package",
-    ),
-    "env instance": (
-        lambda: train(gym.make("CartPole-v1")),
-        "DeclarationError",
-        "it must be a Gymnasium id",
-    ),
-    "env of no package": (lambda: train("procgen-v0"), "EnvError", "no environment 'procgen-v0'"),
-    "env raises in step": (
-        lambda: train(Boom),
-        "EnvError",
-        "of its episode: step() raised ValueError",
-    ),
-    "env returns a wrong shape": (lambda: train(Wrong), "EnvError", "not in its observation_space"),
-    "a mask that allows nothing": (lambda: train(Forbids), "EnvError", "allows no action"),
-    "four values of old gym": (
-        lambda: train(Old),
-        "EnvError",
-        "returned 4 values; Gymnasium needs five",
-    ),
-    "misspelt keyword of an environment": (
-        lambda: train(sw.EnvSpec("CartPole-v1", kwargs={"sutton_bartow_reward": True})),
-        "EnvError",
-        "sutton_bartow_reward",
-    ),
-    "no success to reach": (
-        lambda: sw.train_agent(
-            "CartPole-v1", SMALL, 256, target_success=0.9, eval_every=128, eval_episodes=2
+METHODS: dict[str, list[tuple[Callable[..., Any], str]]] = {
+    "reward": [
+        (
+            lambda _, step: step.next_obs[:, :1],
+            "reward() returned shape (4, 1) at step 1, but (4,) was expected",
         ),
-        "EnvError",
-        "target_success",
-    ),
-    # What a skill's methods return
-    "reward (N, 1)": (
-        lambda: with_skill(reward=lambda _, step: step.next_obs[:, :1]),
-        "SkillError",
-        "reward() returned shape (4, 1) at step 1, but (4,) was expected",
-    ),
-    "reward forgets the N axis": (
-        lambda: with_skill(reward=lambda _, step: float(step.next_obs[0][0])),
-        "SkillError",
-        "one number for each of the 4 environments",
-    ),
-    "reward of one element": (
-        lambda: with_skill(reward=lambda _, step: step.next_obs[0, 0]),
-        "SkillError",
-        "one number for each of the 4 environments, the first axis of every array",
-    ),
-    "reward forgets the N axis by chance": (
-        lambda: by_chance(reward=lambda _, step: step.next_obs[0]),
-        "SkillError",
-        f"reward() returned shape (4,) for 3 environments, but (3,) was expected; for 4 its shape "
-        f"was right by chance: {AXIS}",
-    ),
-    "reward over the wrong axis": (
-        lambda: by_chance(reward=lambda _, step: np.linalg.norm(step.next_obs, axis=0)),
-        "SkillError",
-        AXIS,
-    ),
-    "reward mixes axes": (
-        lambda: by_chance(reward=lambda _, step: step.next_obs[:, 0] * step.next_obs[0]),
-        "SkillError",
-        "reward() answers for 4 environments, but for 3 it raised ValueError",
-    ),
-    "termination forgets the N axis by chance": (
-        lambda: by_chance(termination=lambda _, step: step.next_obs[0] > 1),
-        "SkillError",
-        "termination() returned shape (4,) for 3 environments",
-    ),
-    "success forgets the N axis by chance": (
-        lambda: by_chance(success=lambda _, step: step.next_obs[0] > 1),
-        "SkillError",
-        "success() returned shape (4,) for 3 environments",
-    ),
-    "initiation forgets the N axis by chance": (
-        lambda: by_chance(initiation=lambda _, obs: obs[0] > -9),
-        "SkillError",
-        "initiation() returned shape (4,) for 3 environments",
-    ),
-    "a reflex forgets the N axis by chance": (
-        lambda: train(reflexes=[sw.Reflex(lambda obs: obs[0] > 9, action=1, name="safe")]),
-        "SkillError",
-        "reflex 'safe': condition() returned shape (4,) for 3 environments",
-    ),
-    "a reflex's action forgets the N axis by chance": (
-        lambda: train(
-            reflexes=[
-                sw.Reflex(lambda obs: obs[:, 0] > -9, lambda obs: (obs[0] > 0).astype(int), "safe")
-            ]
+        (lambda _, step: float(step.next_obs[0][0]), "one number for each of the 4 environments"),
+        (
+            lambda _, step: step.next_obs[0, 0],
+            "one number for each of the 4 environments, the first axis of every array",
         ),
-        "SkillError",
-        "reflex 'safe': action() returned shape (4,) for 3 environments",
-    ),
-    "a policy forgets the N axis by chance": (
-        lambda: sw.from_function(
-            lambda obs: (obs[0] > 0).astype(int), action_space=Boom.action_space
-        ).act({}, np.eye(4)),
-        "PolicyError",
-        "function <lambda>() returned shape (4,) for 3 environments",
-    ),
-    "a selector forgets the N axis by chance": (
-        lambda: (
-            FunctionSelector(lambda obs: (obs[0] > 9).astype(int))
-            .among(("left", "right"))
-            .act({}, np.eye(4))
+        (
+            lambda _, step: step.next_obs[0],
+            "reward() returned shape (4,) for 3 environments, but (3,) was expected; for 4 its "
+            f"shape was right by chance: {AXIS}",
         ),
-        "SkillError",
-        "function <lambda>() returned shape (4,) for 3 environments",
-    ),
-    "reward NaN": (
-        lambda: with_skill(reward=lambda _, step: np.full(len(step.obs), np.nan)),
-        "SkillError",
-        "reward() returned nan at step 1 for environment 0: rewards must be finite",
-    ),
-    "reward None": (
-        lambda: with_skill(reward=lambda _, step: None),
-        "SkillError",
-        "reward() returned None at step 1, but shape (4,) was expected: does it lack a return?",
-    ),
-    "a reflex of floats": (
-        lambda: train(reflexes=[sw.Reflex(lambda obs: obs[:, 0] + 9.5, 0)]),
-        "SkillError",
-        "yes or no (bool) is needed",
-    ),
-    "termination is one bool": (
-        lambda: with_skill(termination=lambda _, step: False),
-        "SkillError",
-        "termination() returned shape () at step 1, but (4,) was expected: one yes or no for each",
-    ),
-    "termination returns floats": (
-        lambda: with_skill(termination=lambda _, step: step.next_obs[:, 0]),
-        "SkillError",
-        "but yes or no (bool) is needed: return a comparison",
-    ),
-    "termination uses and": (
-        lambda: with_skill(
-            termination=lambda _, step: step.next_obs[:, 0] > 1 and step.next_obs[:, 1] > 0
+        (
+            lambda _, step: step.next_obs[:, 0] * step.next_obs[0],
+            "reward() answers for 4 environments, but for 3 it raised ValueError",
         ),
-        "SkillError",
-        "combine arrays by & and |, with each side in parentheses",
-    ),
-    "termination takes obs": (
-        lambda: with_skill(termination=lambda _, obs: obs[:, 0] > 1),
-        "SkillError",
-        "its argument is a Step: write step.next_obs[:, 0]",
-    ),
-    "termination takes the mean of obs": (
-        lambda: with_skill(termination=lambda _, obs: obs.mean(axis=1) > 1),
-        "SkillError",
-        "its argument is a Step: write step.next_obs[:, 0]",
-    ),
-    "initiation takes a step": (
-        lambda: with_skill(initiation=lambda _, step: step.obs[:, 0] > 1),
-        "SkillError",
-        "its argument is observations, not a Step: write obs[:, 0]",
-    ),
-    "initiation False everywhere": (
-        lambda: with_skill(initiation=lambda _, obs: np.zeros(len(obs), bool)),
-        "SkillError",
-        "Let at least one start everywhere",
-    ),
-    "no self": (
-        lambda: with_skill(reward=lambda step: step.next_obs[:, 0]),
-        "DeclarationError",
-        "a method of a skill takes (self, step)",
-    ),
-    "initiation takes a goal": (
-        lambda: with_skill(initiation=lambda _, obs, goal: obs[:, 0] > 0),
-        "DeclarationError",
-        "initiation() is called with (obs), but takes (obs, goal): a method of a skill takes "
-        "(self, obs); it is called before the goal is chosen",
-    ),
-    "reward takes a goal": (
-        lambda: with_skill(reward=lambda _, step, goal: step.reward),
-        "DeclarationError",
-        "a method of a skill takes (self, step); the goal is step.goal",
-    ),
-    "goals without rng": (
-        lambda: with_skill(goal_space=gym.spaces.Discrete(2), goals=lambda _, obs: obs),
-        "DeclarationError",
-        "goals() is called with (obs, rng), but takes (obs): ",
-    ),
-    "index out of range": (
-        lambda: with_skill(reward=lambda _, step: step.next_obs[:, 9]),
-        "SkillError",
-        "step.next_obs has the shape (4, 4)",
-    ),
-    "misspelt field of a step": (
-        lambda: with_skill(reward=lambda _, step: step.next_observations[:, 0]),
-        "SkillError",
-        "is 'next_obs' meant?",
-    ),
-    "reward overwrites step.next_obs": (
-        lambda: with_skill(reward=overwrite),
-        "SkillError",
-        "its argument is read-only: change a copy",
-    ),
-    # Declarations
-    "skill class": (lambda: train(skills=[Good]), "DeclarationError", "write Center(), not Center"),
-    "skill with arguments": (
-        lambda: Good(max_steps=50),
-        "DeclarationError",
-        "Good() takes no arguments: write max_steps = 50 in the body of the class",
-    ),
-    "one skill, no list": (
-        lambda: train(skills=Good()),
-        "DeclarationError",
-        "skills=[Center(), ...]",
-    ),
-    "two skills of one name": (
-        lambda: train(skills=[Good(), Good()]),
-        "DeclarationError",
-        "give one another name",
-    ),
-    "no skills": (
-        lambda: sw.Hierarchy("CartPole-v1", []),
-        "DeclarationError",
-        "needs at least one skill",
-    ),
-    "a skill without a name": (
-        lambda: declare(skills=[skill(name="")]),
-        "DeclarationError",
-        "set the class attribute 'name'",
-    ),
-    "skills that never end": (
-        lambda: declare(call_steps=None),
-        "DeclarationError",
-        "give it max_steps or termination()",
-    ),
-    "a function as a reflex": (
-        lambda: declare(reflexes=[zeros]),
-        "DeclarationError",
-        "an instance of Reflex",
-    ),
-    "a policy's class": (
-        lambda: declare(skills=[skill(policy=sw.PPO)]),
-        "DeclarationError",
-        "skill 's': policy is the class",
-    ),
-    "an unknown recipe": (
-        lambda: recipes.load("no_such_recipe"),
-        "DeclarationError",
-        "no recipe or Python file 'no_such_recipe'",
-    ),
-    "misspelt keyword of Hierarchy": (
-        lambda: declare(skill_step=5),
-        "DeclarationError",
-        "is 'skill_steps' meant? It is a setting of apart: write apart=Apart(skill_steps=...)",
-    ),
-    "keyword of a group": (
-        lambda: declare(skill_steps=5),
-        "DeclarationError",
-        "Hierarchy has no setting 'skill_steps'; it is a setting of apart: write "
-        "apart=Apart(skill_steps=...)",
-    ),
-    "keyword of the guide": (
-        lambda: declare(restrict=True),
-        "DeclarationError",
-        "write guide=Guide(restrict=...)",
-    ),
-    "keyword of the algorithm": (
-        lambda: declare(gamma=0.9),
-        "DeclarationError",
-        "it is a setting of algorithm: write algorithm=PPO(gamma=...)",
-    ),
-    "keyword of train": (
-        lambda: declare(seed=3),
-        "DeclarationError",
-        "'seed'; it is an argument of train(): write train(seed=...)",
-    ),
-    "keyword of Hierarchy in train": (
-        lambda: declare().train("runs/r", call_steps=5),
-        "DeclarationError",
-        "write Hierarchy(call_steps=...)",
-    ),
-    "misspelt keyword of train": (
-        lambda: declare().train("runs/r", sed=5),
-        "DeclarationError",
-        "is 'seed' meant",
-    ),
-    "misspelt keyword of PPO": (
-        lambda: sw.PPO(learning_rat=1e-3),
-        "DeclarationError",
-        "PPO has no setting 'learning_rat': is 'learning_rate' meant?",
-    ),
-    "keyword of another library": (
-        lambda: sw.PPO(n_envs=8),
-        "DeclarationError",
-        "is 'num_envs' meant?",
-    ),
-    "misspelt keyword of Together": (
-        lambda: sw.Together(intterupt=True),
-        "DeclarationError",
-        "is 'interrupt' meant?",
-    ),
-    "misspelt keyword of Agent": (
-        lambda: sw.Agent("CartPole-v1", SMALL, 5, target_retrun=3),
-        "DeclarationError",
-        "is 'target_return' meant?",
-    ),
-    "misspelt keyword of train_agent": (
-        lambda: sw.train_agent("CartPole-v1", SMALL, 5, "runs/r", seeed=3),
-        "DeclarationError",
-        "is 'seed' meant?",
-    ),
-    "train_agent without a budget": (
-        lambda: sw.train_agent("CartPole-v1", SMALL),
-        "DeclarationError",
-        "train_agent() needs steps",
-    ),
-    "misspelt attribute": (
-        lambda: setattr(declare(), "call_step", 5),
-        "DeclarationError",
-        "Hierarchy has no setting 'call_step': is 'call_steps' meant?",
-    ),
-    "attribute of a group": (
-        lambda: setattr(declare(), "skill_steps", 5),
-        "DeclarationError",
-        "it is a setting of apart: write apart=Apart(skill_steps=...)",
-    ),
-    "changed group": (
-        lambda: setattr(declare().apart, "skill_steps", 5),
-        "DeclarationError",
-        "Apart cannot be changed: make another one, with dataclasses.replace(..., skill_steps=5)",
-    ),
-    "misspelt attribute of an agent": (
-        lambda: setattr(sw.Agent("CartPole-v1", SMALL, 5), "stepps", 5),
-        "DeclarationError",
-        "is 'steps' meant?",
-    ),
-    "negative learning rate": (
-        lambda: sw.PPO(learning_rate=-1),
-        "DeclarationError",
-        "PPO.learning_rate is -1",
-    ),
-    "gamma of 99": (
-        lambda: sw.PPO(gamma=99),
-        "DeclarationError",
-        "PPO.gamma is 99; it must be between 0 and 1",
-    ),
-    "batch_size over a rollout": (
-        lambda: sw.PPO(num_envs=4, n_steps=8, batch_size=512),
-        "DeclarationError",
-        "PPO.batch_size is 512",
-    ),
-    "DQN on continuous actions": (
-        lambda: train("Pendulum-v1", skills=[skill()], algorithm=sw.DQN(num_envs=4)),
-        "DeclarationError",
-        "DQN cannot act in Box",
-    ),
-    "algorithm as text": (lambda: train(algorithm="PPO"), "DeclarationError", "algorithm is 'PPO'"),
-    "algorithm class": (
-        lambda: train(algorithm=sw.PPO),
-        "DeclarationError",
-        "write PPO(), not PPO",
-    ),
-    "misspelt way of learning": (
-        lambda: train(learn="jointly"),
-        "DeclarationError",
-        "'apart, then together'",
-    ),
-    "call_steps=0": (
-        lambda: train(call_steps=0),
-        "DeclarationError",
-        "call_steps is 0; it must be a whole number",
-    ),
-    # Runs
-    "run_dir is a file": (file_in_the_way, "RunError", "afile"),
-    "run_dir not writable": (
-        lambda: declare().train("/proc/x/run", quiet=True),
-        "RunError",
-        "/proc/x/run",
-    ),
-    "load of no run": (lambda: declare().load("runs/nope"), "RunError", "runs/nope holds no run"),
-    "load of another recipe": (
-        lambda: (trained(), declare(skills=[skill(name="other")]).load("runs/ok")),
-        "RunError",
-        "runs/ok was trained with the skills good, but this hierarchy has other",
-    ),
-    "resume of another recipe": (
-        lambda: (trained(), declare(skills=[skill(name="other")]).resume("runs/ok")),
-        "RunError",
-        "runs/ok was trained with the skills good, but this hierarchy has other",
-    ),
-    "load with another env": (
-        lambda: (trained(), declare("Acrobot-v1").load("runs/ok")),
-        "RunError",
-        "was trained on CartPole-v1",
-    ),
-    "misspelt keyword of evaluate": (
-        lambda: trained().load("runs/ok").evaluate(episode=5),
-        "DeclarationError",
-        "is 'episodes' meant?",
-    ),
-    "seed by position": (
-        lambda: trained().load("runs/ok").evaluate(5, 3),
-        "DeclarationError",
-        "evaluate() takes at most 1 of its arguments by position, but 2 were given: name the "
-        "others, seed=... for example",
-    ),
-    "render to .avi": (
-        lambda: trained().load("runs/ok").render("x.avi"),
-        "DeclarationError",
-        ".gif or .mp4",
-    ),
-    "evaluate(0)": (
-        lambda: trained().load("runs/ok").evaluate(0),
-        "DeclarationError",
-        "episodes is 0",
-    ),
-    # Ready parts
-    "selector of an unknown name": (
-        lambda: train(
-            skills=[skill(policy=zeros)], selector=lambda obs: np.full(len(obs), "landd")
-        ).evaluate(2),
-        "SkillError",
-        "names 'landd', which is no skill of the hierarchy; its skills are: s",
-    ),
-    "selector of floats": (
-        lambda: train(
-            skills=[skill(policy=zeros)], selector=lambda obs: np.zeros(len(obs))
-        ).evaluate(2),
-        "SkillError",
-        "whole numbers",
-    ),
-    "policy of one action for all": (
-        lambda: train(skills=[skill(policy=lambda _, obs: 1)]).evaluate(2),
-        "PolicyError",
-        "one action of Discrete(2) for each",
-    ),
-    "policy of an action outside": (
-        lambda: train(skills=[skill(policy=lambda _, obs: np.full(len(obs), 7))]).evaluate(2),
-        "PolicyError",
-        "returned 7, which is no action of Discrete(2)",
-    ),
-    "reflex of a forbidden action": (
-        lambda: train(reflexes=[sw.Reflex(lambda obs: obs[:, 0] > 0, action=5)]),
-        "DeclarationError",
-        "action returned 5, which is no action of Discrete(2)",
-    ),
-    "misspelt tracker": (
-        lambda: declare().train("runs/tr", track=["tensorbord"]),
-        "DeclarationError",
-        "no tracker 'tensorbord': is 'tensorboard' meant?",
-    ),
-    "features as text": (
-        lambda: declare(features="x"),
-        "DeclarationError",
-        "Hierarchy: features is 'x'",
-    ),
-    "demonstrations": (
-        lambda: declare().train("runs/de", demonstrations="demos.npz"),
-        "DeclarationError",
-        "recorded data",
-    ),
-    "wrong key of a Dict": (
-        lambda: in_room(reward=lambda _, step: step.next_obs["hold"][:, 0]),
-        "SkillError",
-        KEYS,
-    ),
-    "column of a Dict": (
-        lambda: in_room(reward=lambda _, step: step.next_obs[:, 0]),
-        "SkillError",
-        KEYS,
-    ),
-    "wrong key in initiation": (
-        lambda: in_room(initiation=lambda _, obs: obs["hold"]),
-        "SkillError",
-        KEYS,
-    ),
-    "wrong key in sees": (
-        lambda: in_room(sees=("hold",)),
-        "DeclarationError",
-        "is 'held' meant?",
-    ),
-    "seed as text": (
-        lambda: declare().train("runs/sd", seed="1"),
-        "DeclarationError",
-        "it must be a whole number",
-    ),
+        (
+            lambda _, step: np.full(len(step.obs), np.nan),
+            "reward() returned nan at step 1 for environment 0: rewards must be finite",
+        ),
+        (
+            lambda _, step: None,
+            "reward() returned None at step 1, but shape (4,) was expected: does it lack a return?",
+        ),
+        (lambda _, step: step.next_obs[:, 9], "step.next_obs has the shape (4, 4)"),
+        (lambda _, step: step.next_observations[:, 0], "is 'next_obs' meant?"),
+        (overwrite, "its argument is read-only: change a copy"),
+    ],
+    "termination": [
+        (
+            lambda _, step: step.next_obs[0] > 1,
+            "termination() returned shape (4,) for 3 environments",
+        ),
+        (
+            lambda _, step: False,
+            "termination() returned shape () at step 1, but (4,) was expected: one yes or no for",
+        ),
+        (
+            lambda _, step: step.next_obs[:, 0],
+            "but yes or no (bool) is needed: return a comparison",
+        ),
+        (
+            lambda _, step: step.next_obs[:, 0] > 1 and step.next_obs[:, 1] > 0,
+            "combine arrays by & and |, with each side in parentheses",
+        ),
+        (lambda _, obs: obs[:, 0] > 1, "its argument is a Step: write step.next_obs[:, 0]"),
+        (lambda _, obs: obs.mean(axis=1) > 1, "its argument is a Step: write step.next_obs[:, 0]"),
+    ],
+    "success": [
+        (lambda _, step: step.next_obs[0] > 1, "success() returned shape (4,) for 3 environments"),
+    ],
+    "initiation": [
+        (lambda _, obs: obs[0] > -9, "initiation() returned shape (4,) for 3 environments"),
+        (
+            lambda _, step: step.obs[:, 0] > 1,
+            "its argument is observations, not a Step: write obs[:, 0]",
+        ),
+        (lambda _, obs: np.zeros(len(obs), bool), "Let at least one start everywhere"),
+    ],
 }
+"""Methods of a skill, and words of the SkillError."""
+MISTAKES: dict[str, dict[str, tuple[Callable[[], Any], str]]] = {
+    "EnvError": {
+        "misspelt env id": (lambda: train("CartPol-v1"), "is 'CartPole-v1' meant?"),
+        "old env id": (lambda: train("LunarLander-v2"), "use `LunarLander-v3` instead"),
+        "env not imported": (lambda: train("ALE/Pong-v5"), "install and import that package"),
+        "env of no package": (lambda: train("procgen-v0"), "no environment 'procgen-v0'"),
+        "env raises in step": (lambda: train(Boom), "of its episode: step() raised ValueError"),
+        "env returns a wrong shape": (lambda: train(Wrong), "not in its observation_space"),
+        "a mask that allows nothing": (lambda: train(Forbids), "allows no action"),
+        "four values of old gym": (lambda: train(Old), "returned 4 values; Gymnasium needs five"),
+        "misspelt keyword of an environment": (
+            lambda: train(sw.EnvSpec("CartPole-v1", kwargs={"sutton_bartow_reward": True})),
+            "sutton_bartow_reward",
+        ),
+        "no success to reach": (
+            lambda: sw.train_agent(
+                "CartPole-v1", SMALL, 256, target_success=0.9, eval_every=128, eval_episodes=2
+            ),
+            "target_success",
+        ),
+    },
+    "DeclarationError": {
+        "env instance": (lambda: train(gym.make("CartPole-v1")), "it must be a Gymnasium id"),
+        "no self": (
+            lambda: with_skill(reward=lambda step: step.next_obs[:, 0]),
+            "a method of a skill takes (self, step)",
+        ),
+        "initiation takes a goal": (
+            lambda: with_skill(initiation=lambda _, obs, goal: obs[:, 0] > 0),
+            "initiation() is called with (obs), but takes (obs, goal): a method of a skill takes "
+            "(self, obs); it is called before the goal is chosen",
+        ),
+        "reward takes a goal": (
+            lambda: with_skill(reward=lambda _, step, goal: step.reward),
+            "a method of a skill takes (self, step); the goal is step.goal",
+        ),
+        "goals without rng": (
+            lambda: with_skill(goal_space=gym.spaces.Discrete(2), goals=lambda _, obs: obs),
+            "goals() is called with (obs, rng), but takes (obs): ",
+        ),
+        "skill class": (lambda: train(skills=[Good]), "write Center(), not Center"),
+        "skill with arguments": (
+            lambda: Good(max_steps=50),
+            "Good() takes no arguments: write max_steps = 50 in the body of the class",
+        ),
+        "one skill, no list": (lambda: train(skills=Good()), "skills=[Center(), ...]"),
+        "two skills of one name": (lambda: train(skills=[Good(), Good()]), "give one another name"),
+        "no skills": (lambda: sw.Hierarchy("CartPole-v1", []), "needs at least one skill"),
+        "a skill without a name": (
+            lambda: declare(skills=[skill(name="")]),
+            "set the class attribute 'name'",
+        ),
+        "skills that never end": (
+            lambda: declare(call_steps=None),
+            "give it max_steps or termination()",
+        ),
+        "a function as a reflex": (lambda: declare(reflexes=[zeros]), "an instance of Reflex"),
+        "a policy's class": (
+            lambda: declare(skills=[skill(policy=sw.PPO)]),
+            "skill 's': policy is the class",
+        ),
+        "an unknown recipe": (
+            lambda: recipes.load("no_such_recipe"),
+            "no recipe or Python file 'no_such_recipe'",
+        ),
+        "misspelt keyword of Hierarchy": (
+            lambda: declare(skill_step=5),
+            "is 'skill_steps' meant? It is a setting of apart: write apart=Apart(skill_steps=...)",
+        ),
+        "keyword of a group": (
+            lambda: declare(skill_steps=5),
+            "Hierarchy has no setting 'skill_steps'; it is a setting of apart: write "
+            "apart=Apart(skill_steps=...)",
+        ),
+        "keyword of the guide": (lambda: declare(restrict=True), "write guide=Guide(restrict=...)"),
+        "keyword of the algorithm": (
+            lambda: declare(gamma=0.9),
+            "it is a setting of algorithm: write algorithm=PPO(gamma=...)",
+        ),
+        "keyword of train": (
+            lambda: declare(seed=3),
+            "'seed'; it is an argument of train(): write train(seed=...)",
+        ),
+        "keyword of Hierarchy in train": (
+            lambda: declare().train("runs/r", call_steps=5),
+            "write Hierarchy(call_steps=...)",
+        ),
+        "misspelt keyword of train_agent": (
+            lambda: sw.train_agent("CartPole-v1", SMALL, 5, "runs/r", seeed=3),
+            "is 'seed' meant?",
+        ),
+        "train_agent without a budget": (
+            lambda: sw.train_agent("CartPole-v1", SMALL),
+            "train_agent() needs steps",
+        ),
+        "attribute of a group": (
+            lambda: setattr(declare(), "skill_steps", 5),
+            "it is a setting of apart: write apart=Apart(skill_steps=...)",
+        ),
+        "changed group": (
+            lambda: setattr(declare().apart, "skill_steps", 5),
+            "Apart cannot be changed: make another one, with "
+            "dataclasses.replace(..., skill_steps=5)",
+        ),
+        "batch_size over a rollout": (
+            lambda: sw.PPO(num_envs=4, n_steps=8, batch_size=512),
+            "PPO.batch_size is 512",
+        ),
+        "DQN on continuous actions": (
+            lambda: train("Pendulum-v1", skills=[skill()], algorithm=sw.DQN(num_envs=4)),
+            "DQN cannot act in Box",
+        ),
+        "algorithm class": (lambda: train(algorithm=sw.PPO), "write PPO(), not PPO"),
+        "misspelt keyword of evaluate": (
+            lambda: trained().load("runs/ok").evaluate(episode=5),
+            "is 'episodes' meant?",
+        ),
+        "seed by position": (
+            lambda: trained().load("runs/ok").evaluate(5, 3),
+            "evaluate() takes at most 1 of its arguments by position, but 2 were given: name the "
+            "others, seed=... for example",
+        ),
+        "render to .avi": (lambda: trained().load("runs/ok").render("x.avi"), ".gif or .mp4"),
+        "evaluate(0)": (lambda: trained().load("runs/ok").evaluate(0), "episodes is 0"),
+        "reflex of a forbidden action": (
+            lambda: train(reflexes=[sw.Reflex(lambda obs: obs[:, 0] > 0, action=5)]),
+            "action returned 5, which is no action of Discrete(2)",
+        ),
+        "misspelt tracker": (
+            lambda: declare().train("runs/tr", track=["tensorbord"]),
+            "no tracker 'tensorbord': is 'tensorboard' meant?",
+        ),
+        "features as text": (lambda: declare(features="x"), "Hierarchy: features is 'x'"),
+        "demonstrations": (
+            lambda: declare().train("runs/de", demonstrations="demos.npz"),
+            "recorded data",
+        ),
+        "wrong key in sees": (lambda: in_room(sees=("hold",)), "is 'held' meant?"),
+        "seed as text": (lambda: declare().train("runs/sd", seed="1"), "it must be a whole number"),
+    },
+    "SkillError": {
+        "a reflex forgets the N axis by chance": (
+            lambda: train(reflexes=[sw.Reflex(lambda obs: obs[0] > 9, action=1, name="safe")]),
+            "reflex 'safe': condition() returned shape (4,) for 3 environments",
+        ),
+        "a reflex's action forgets the N axis by chance": (
+            lambda: train(
+                reflexes=[
+                    sw.Reflex(
+                        lambda obs: obs[:, 0] > -9, lambda obs: (obs[0] > 0).astype(int), "safe"
+                    )
+                ]
+            ),
+            "reflex 'safe': action() returned shape (4,) for 3 environments",
+        ),
+        "a selector forgets the N axis by chance": (
+            lambda: (
+                FunctionSelector(lambda obs: (obs[0] > 9).astype(int))
+                .among(("left", "right"))
+                .act({}, np.eye(4))
+            ),
+            "function <lambda>() returned shape (4,) for 3 environments",
+        ),
+        "a reflex of floats": (
+            lambda: train(reflexes=[sw.Reflex(lambda obs: obs[:, 0] + 9.5, 0)]),
+            "yes or no (bool) is needed",
+        ),
+        "selector of an unknown name": (
+            lambda: train(
+                skills=[skill(policy=zeros)], selector=lambda obs: np.full(len(obs), "landd")
+            ).evaluate(2),
+            "names 'landd', which is no skill of the hierarchy; its skills are: s",
+        ),
+        "selector of floats": (
+            lambda: train(
+                skills=[skill(policy=zeros)], selector=lambda obs: np.zeros(len(obs))
+            ).evaluate(2),
+            "whole numbers",
+        ),
+        "wrong key of a Dict": (
+            lambda: in_room(reward=lambda _, step: step.next_obs["hold"][:, 0]),
+            KEYS,
+        ),
+        "column of a Dict": (lambda: in_room(reward=lambda _, step: step.next_obs[:, 0]), KEYS),
+        "wrong key in initiation": (lambda: in_room(initiation=lambda _, obs: obs["hold"]), KEYS),
+    },
+    "PolicyError": {
+        "a policy forgets the N axis by chance": (
+            lambda: sw.from_function(
+                lambda obs: (obs[0] > 0).astype(int), action_space=gym.spaces.Discrete(2)
+            ).act({}, np.eye(4)),
+            "function <lambda>() returned shape (4,) for 3 environments",
+        ),
+        "policy of one action for all": (
+            lambda: train(skills=[skill(policy=lambda _, obs: 1)]).evaluate(2),
+            "one action of Discrete(2) for each",
+        ),
+        "policy of an action outside": (
+            lambda: train(skills=[skill(policy=lambda _, obs: np.full(len(obs), 7))]).evaluate(2),
+            "returned 7, which is no action of Discrete(2)",
+        ),
+    },
+    "RunError": {
+        "run_dir is a file": (file_in_the_way, "afile"),
+        "run_dir not writable": (lambda: declare().train("/proc/x/run", quiet=True), "/proc/x/run"),
+        "load of no run": (lambda: declare().load("runs/nope"), "runs/nope holds no run"),
+        "load of another recipe": (
+            lambda: (trained(), declare(skills=[skill(name="other")]).load("runs/ok")),
+            "runs/ok was trained with the skills good, but this hierarchy has other",
+        ),
+        "resume of another recipe": (
+            lambda: (trained(), declare(skills=[skill(name="other")]).resume("runs/ok")),
+            "runs/ok was trained with the skills good, but this hierarchy has other",
+        ),
+        "load with another env": (
+            lambda: (trained(), declare("Acrobot-v1").load("runs/ok")),
+            "was trained on CartPole-v1",
+        ),
+    },
+}
+"""By the kind of the error: what is done, and words of its message."""
 
 
 @pytest.fixture(autouse=True)
@@ -620,12 +402,26 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(gym.registry, "LunarLander-v2", raising=False)
 
 
-@pytest.mark.parametrize("label", MISTAKES)
-def test_a_mistake_is_an_error_that_names_the_thing(label: str) -> None:
-    mistake, kind, words = MISTAKES[label]
+@pytest.mark.parametrize(
+    ("kind", "label"), [(kind, label) for kind, made in MISTAKES.items() for label in made]
+)
+def test_a_mistake_is_an_error_that_names_the_thing(kind, label):
+    mistake, words = MISTAKES[kind][label]
+    assert_refused(KINDS[kind], words, mistake)
+
+
+@pytest.mark.parametrize(
+    ("method", "function", "words"),
+    [(method, *wrong) for method, tried in METHODS.items() for wrong in tried],
+)
+def test_a_method_that_is_wrong_is_an_error_that_names_the_thing(method, function, words):
+    assert_refused(SkillError, words, lambda: with_skill(**{method: function}))
+
+
+def assert_refused(kind: type[SkillweaveError], words: str, mistake: Callable[[], Any]) -> None:
     with pytest.raises(SkillweaveError) as caught:
         mistake()
-    assert type(caught.value) is KINDS[kind]
+    assert type(caught.value) is kind
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -648,7 +444,7 @@ CHANGED = {
 
 
 @pytest.mark.parametrize("name", CHANGED)
-def test_what_is_set_after_the_declaration_is_checked_as_well(name: str) -> None:
+def test_what_is_set_after_the_declaration_is_checked_as_well(name):
     value, words = CHANGED[name]
     with pytest.raises(SkillweaveError) as caught:
         changed(**{name: value})
@@ -656,9 +452,9 @@ def test_what_is_set_after_the_declaration_is_checked_as_well(name: str) -> None
     assert not Path("runs/changed").exists()
 
 
-def test_what_is_set_on_an_agent_or_a_skill_afterwards_is_checked_as_well() -> None:
+def test_what_is_set_on_an_agent_or_a_skill_afterwards_is_checked_as_well():
     agent = sw.Agent("CartPole-v1", SMALL, 256)
-    agent.steps = "many"  # type: ignore[assignment]
+    agent.steps = "many"
     with pytest.raises(SkillweaveError, match="steps is 'many'"):
         agent.train("runs/agent", quiet=True)
     hierarchy = declare()
@@ -667,7 +463,7 @@ def test_what_is_set_on_an_agent_or_a_skill_afterwards_is_checked_as_well() -> N
         hierarchy.train("runs/changed", quiet=True)
 
 
-def test_what_is_set_on_a_hierarchy_inside_afterwards_is_checked_as_well() -> None:
+def test_what_is_set_on_a_hierarchy_inside_afterwards_is_checked_as_well():
     inner = declare()
     outer = declare(skills=[inner, Good()])
     inner.call_steps = 0
@@ -684,20 +480,20 @@ WARNED = {
 
 
 @pytest.mark.parametrize("name", WARNED)
-def test_a_misspelt_attribute_of_a_skill_is_a_warning(name: str) -> None:
+def test_a_misspelt_attribute_of_a_skill_is_a_warning(name):
     members, meant = WARNED[name]
     with pytest.warns(UserWarning, match=f"has '{name}', .* is '{meant}' meant"):
         declare(skills=[skill(**members)])
 
 
-def test_a_misspelt_attribute_of_a_skills_instance_is_a_warning() -> None:
+def test_a_misspelt_attribute_of_a_skills_instance_is_a_warning():
     mine = Good()
     mine.max_step = 5
     with pytest.warns(UserWarning, match="has 'max_step', .* is 'max_steps' meant"):
         declare(skills=[mine])
 
 
-def test_names_that_a_skills_methods_use_are_its_own() -> None:
+def test_names_that_a_skills_methods_use_are_its_own():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         declare(
@@ -737,26 +533,26 @@ LEGAL = {
 
 @pytest.mark.filterwarnings("ignore:The given NumPy array is not writable")
 @pytest.mark.parametrize("label", LEGAL)
-def test_unusual_but_legal_ways_work(label: str) -> None:
+def test_unusual_but_legal_ways_work(label):
     assert with_skill(**LEGAL[label]).path.is_dir()
 
 
-def test_training_without_a_directory_is_either_refused_or_makes_one() -> None:
+def test_training_without_a_directory_is_either_refused_or_makes_one():
     # Which of both depends on the signature of train().
     optional = inspect.signature(sw.Hierarchy.train).parameters["run_dir"].default is None
     with nullcontext() if optional else pytest.raises(SkillweaveError, match="needs run_dir"):
         assert declare().train(quiet=True).path.is_dir()
 
 
-def test_a_resumed_run_goes_on_with_its_own_settings(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_resumed_run_goes_on_with_its_own_settings(capsys):
     trained()
     declare(call_steps=7).resume("runs/ok")
     assert "call_steps is 40 (declared now: 7)" in capsys.readouterr().err
 
 
 def test_looking_for_a_forgotten_axis_does_not_change_training(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     def weights(run_dir: str) -> dict[str, Any]:
         np.random.seed(0)  # noqa: NPY002
         declare(skills=[Draws()]).train(run_dir, quiet=True)

@@ -256,6 +256,15 @@ def test_selectors_at_all_levels_stay_near_their_guides(whole):
     assert inner.guide.restricts
 
 
+def watch(run, look):
+    """Play a run's policy for a while; ``look`` at its memory before each step."""
+    engine = make_engine(CARTPOLE, 1)
+    engine.reset(0)
+    rng = np.random.default_rng(0)
+    episodes = SeededEpisodes(engine, range(9), 100)
+    list(play(run.policy, episodes, deterministic=False, rng=rng, before_step=look))
+
+
 def test_a_guide_in_a_hierarchy_below_is_kept_to(whole):
     run, _ = whole("guides, start calls")
     called = set()
@@ -265,11 +274,7 @@ def test_a_guide_in_a_hierarchy_below_is_kept_to(whole):
         acts = (memory["skill"] == 1) & (memory["1"]["elapsed"] == 0)
         called.update(memory["1"]["skill"][acts & high].tolist())
 
-    engine = make_engine(CARTPOLE, 1)
-    engine.reset(0)
-    rng = np.random.default_rng(0)
-    episodes = SeededEpisodes(engine, range(9), 100)
-    list(play(run.policy, episodes, deterministic=False, rng=rng, before_step=look))
+    watch(run, look)
     assert called == {1}
 
 
@@ -289,15 +294,12 @@ def test_all_go_on_with_their_whole_states_by_path(tmp_path):
     run = stopped_run(KINDS["then, inside and outside"](), tmp_path / "run", 20)
     found = {f.name.removesuffix(".safetensors") for f in (run.path / "states").iterdir()}
     assert found == {"left", "selector", "inner.balance", "inner.right", "inner.selector"}
+    entry = run.stage("inner/together")
+    judged, entry.kept = entry.kept, Comparison("before")
+    assert run.load_state("inner/right", SimpleNamespace()) is None, "it was not kept"
+    entry.kept = judged
     KINDS["then, inside and outside"]().resume(run.path, quiet=True)
     assert not (run.path / "states").exists()
-
-
-def test_a_state_that_was_not_kept_is_not_gone_on_with(tmp_path):
-    run = stopped_run(KINDS["then, inside and outside"](), tmp_path / "run", 20)
-    like = SimpleNamespace()
-    run.stage("inner/together").kept = Comparison("before")
-    assert run.load_state("inner/right", like) is None
 
 
 def test_calls_are_logged_by_the_paths_of_who_acts(whole):
@@ -360,15 +362,7 @@ def test_a_skill_of_a_hierarchy_below_acts_alone(whole):
 def test_captions_name_the_path(whole):
     run, _ = whole("together")
     seen = set()
-
-    def name(memory):
-        seen.add(run.policy.acts(memory))
-
-    engine = make_engine(CARTPOLE, 1)
-    engine.reset(0)
-    rng = np.random.default_rng(0)
-    episodes = SeededEpisodes(engine, range(9), 100)
-    list(play(run.policy, episodes, deterministic=False, rng=rng, before_step=name))
+    watch(run, lambda memory: seen.add(run.policy.acts(memory)))
     assert {"left", "inner/right"} <= seen <= {"left", "inner/right", "inner/balance", "push"}
 
 

@@ -82,7 +82,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return hierarchy(steps=200).train(tmp_path_factory.mktemp("runs") / "run", quiet=True)
 
 
-def test_a_table_escapes_everything() -> None:
+def test_a_table_escapes_everything():
     text = table(["<a>"], [["<script>alert(1)</script>", 3], ['"&', None]])
     assert "<script>" not in text
     assert "&lt;script&gt;" in text
@@ -90,7 +90,7 @@ def test_a_table_escapes_everything() -> None:
     assert Well(joined([text, facts([("<x>", "<y>")])])).words[0] == "<a>"
 
 
-def test_a_skill_tells_what_it_declares() -> None:
+def test_a_skill_tells_what_it_declares():
     assert repr(Center()) == "<Skill 'center': reward, max_steps=20>"
     assert repr(Skill()) == "<Skill '': all defaults>"
     assert repr(Idle()).startswith("<Skill 'idle': policy=")
@@ -99,7 +99,7 @@ def test_a_skill_tells_what_it_declares() -> None:
     assert words[-2:] == ["max_steps", "20"]
 
 
-def test_a_hierarchy_tells_its_skills_at_all_levels() -> None:
+def test_a_hierarchy_tells_its_skills_at_all_levels():
     inner = hierarchy(name="inner")
     outer = Hierarchy("CartPole-v1", [inner, Center()], selector=tree.Sequence("inner", "center"))
     assert repr(inner) == "<Hierarchy of center, idle on CartPole-v1>"
@@ -110,13 +110,13 @@ def test_a_hierarchy_tells_its_skills_at_all_levels() -> None:
     assert words[words.index("inner") + 1] == "hierarchy"
 
 
-def test_an_agent_tells_what_it_learns() -> None:
+def test_an_agent_tells_what_it_learns():
     agent = Agent("CartPole-v1", TINY, 3_000)
     assert repr(agent) == "<Agent of PPO on CartPole-v1>"
     assert "3,000" in read(agent).words
 
 
-def test_a_run_tells_its_stages_and_its_evaluation(run: Run) -> None:
+def test_a_run_tells_its_stages_and_its_evaluation(run):
     assert repr(run) == f"<Run {run.path}: Hierarchy of center, idle on CartPole-v1>"
     assert "evaluation" not in "".join(read(run).words)
     run.evaluate(2, save=True)
@@ -125,25 +125,25 @@ def test_a_run_tells_its_stages_and_its_evaluation(run: Run) -> None:
     assert words[-1].startswith("evaluation: ")
 
 
-def test_a_run_that_is_damaged_or_gone_is_shown_all_the_same(run: Run, tmp_path: Path) -> None:
+def test_a_run_that_is_damaged_or_gone_is_shown_all_the_same(run, tmp_path):
     gone = Run(run.declaration, tmp_path / "gone", run.policy)
     assert "center" in read(gone).words
     (tmp_path / "run.json").write_text("{")
     assert "run.json" in read(Run(run.declaration, tmp_path, run.policy)).words[-1]
 
 
-def test_a_run_of_recorded_skills_is_shown(run: Run, tmp_path: Path) -> None:
+def test_a_run_of_recorded_skills_is_shown(run, tmp_path):
     again = Hierarchy.from_manifest({**run.info(), "needs_recipe": False})
     assert "learnt" in read(again).words
 
 
-def test_an_evaluation_is_a_line_and_a_table() -> None:
+def test_an_evaluation_is_a_line_and_a_table():
     plain = Evaluation((1.0, 2.0), (3, 4), None)
     assert repr(plain) == f"<Evaluation: {plain}>"
     assert read(plain).words == [str(plain)]
 
 
-def test_an_evaluation_of_skills_has_a_table_of_them(run: Run) -> None:
+def test_an_evaluation_of_skills_has_a_table_of_them(run):
     found = run.evaluate(2)
     words = read(found).words
     assert words[0] == str(found)
@@ -151,7 +151,7 @@ def test_an_evaluation_of_skills_has_a_table_of_them(run: Run) -> None:
     assert {"center", "idle"} <= set(words)
 
 
-def test_render_without_a_path_writes_into_the_run_and_shows_the_film(run: Run) -> None:
+def test_render_without_a_path_writes_into_the_run_and_shows_the_film(run):
     pytest.importorskip("PIL")
     film = run.render(max_steps=5)
     assert film["path"] == str(run.path / "film.gif")
@@ -165,9 +165,7 @@ def test_render_without_a_path_writes_into_the_run_and_shows_the_film(run: Run) 
     assert run.render(skill="idle", max_steps=5)["path"] == str(run.path / "film-idle.gif")
 
 
-def test_render_of_a_weights_file_writes_here(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_render_of_a_weights_file_writes_here(run, tmp_path, monkeypatch):
     pytest.importorskip("PIL")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "elsewhere").mkdir()
@@ -176,7 +174,7 @@ def test_render_of_a_weights_file_writes_here(
     assert (tmp_path / "cart.gif").exists()
 
 
-def test_an_mp4_is_a_video_and_a_film_that_is_gone_is_told(tmp_path: Path) -> None:
+def test_an_mp4_is_a_video_and_a_film_that_is_gone_is_told(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"film")
     film = Film(path=str(tmp_path / "a.mp4"), frames=3, episodes=[{"return": 1.0}])
     assert f"data:video/mp4;base64,{base64.b64encode(b'film').decode()}" in film._repr_html_()
@@ -221,7 +219,7 @@ def outputs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Any]]:
 
 
 @pytest.mark.slow
-def test_the_example_shows_tables_and_films_and_nothing_raw(outputs: list[list[Any]]) -> None:
+def test_the_example_shows_tables_and_films_and_nothing_raw(outputs):
     shown = [output for cell in outputs for output in cell]
     assert {output.output_type for output in shown} == {"execute_result", "display_data"}
     for output in shown:
@@ -239,7 +237,7 @@ def test_the_example_shows_tables_and_films_and_nothing_raw(outputs: list[list[A
 
 
 @pytest.mark.slow
-def test_training_in_the_example_leaves_its_last_progress(outputs: list[list[Any]]) -> None:
+def test_training_in_the_example_leaves_its_last_progress(outputs):
     html = outputs[2][0].data["text/html"]
     assert "<progress" in html
     assert "done in" in html
@@ -278,9 +276,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
     return kernel
 
 
-def test_a_notebook_is_told_from_a_terminal(
-    monkeypatch: pytest.MonkeyPatch, kernel: Kernel
-) -> None:
+def test_a_notebook_is_told_from_a_terminal(monkeypatch, kernel):
     assert in_notebook()
     terminal = SimpleNamespace(get_ipython=SimpleNamespace)
     monkeypatch.setitem(sys.modules, "IPython", terminal)
@@ -289,9 +285,7 @@ def test_a_notebook_is_told_from_a_terminal(
     assert not module.in_notebook()
 
 
-def test_progress_in_a_notebook_leaves_one_table(
-    kernel: Kernel, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_progress_in_a_notebook_leaves_one_table(kernel, capsys):
     names = ["left", "right"]
     with Progress() as progress:
         progress.plan([stage_entry(name, "waiting", budget=100) for name in names])
@@ -311,9 +305,7 @@ def test_progress_in_a_notebook_leaves_one_table(
     assert line in output["text/plain"].splitlines()
 
 
-def test_an_evaluation_in_a_notebook_leaves_nothing_but_its_result(
-    kernel: Kernel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_evaluation_in_a_notebook_leaves_nothing_but_its_result(kernel, monkeypatch):
     from skillweave.reporting import progress as timed
 
     now = iter([0.0, 2.0, 4.0])

@@ -20,22 +20,22 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 
 
-def test_dir_lists_the_public_names_alone() -> None:
+def test_dir_lists_the_public_names_alone():
     assert dir(skillweave) == sorted(skillweave.__all__)
 
 
-def test_the_command_prints_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_the_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"skillweave {skillweave.__version__}\n"
 
 
-def test_help_names_the_version_option(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_names_the_version_option(capsys):
     with pytest.raises(SystemExit):
         main(["--help"])
     assert "--version" in capsys.readouterr().out
 
 
-def test_the_version_is_the_same_everywhere() -> None:
+def test_the_version_is_the_same_everywhere():
     (cited,) = re.findall(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.M)
     (latest, *_) = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.M)
     assert cited == latest == skillweave.__version__
@@ -54,14 +54,14 @@ def packages_of(extra: str) -> set[str]:
     return packages
 
 
-def test_all_has_every_extra_for_users_and_dev_has_everything() -> None:
+def test_all_has_every_extra_for_users_and_dev_has_everything():
     for extra in set(EXTRAS) - {"docs", "bench", "dev"}:
         assert packages_of(extra) <= packages_of("all"), extra
     for extra in EXTRAS:
         assert packages_of(extra) <= packages_of("dev"), extra
 
 
-def test_the_page_about_installing_names_every_extra() -> None:
+def test_the_page_about_installing_names_every_extra():
     page = (ROOT / "docs/install.md").read_text()
     table = page.split("## Extras")[1].split("\n## ")[0]
     named = {
@@ -73,7 +73,7 @@ def test_the_page_about_installing_names_every_extra() -> None:
     assert named == set(EXTRAS)
 
 
-def test_the_wheel_says_that_it_has_types_and_has_every_file_of_the_package(tmp_path: Path) -> None:
+def test_the_wheel_says_that_it_has_types_and_has_every_file_of_the_package(tmp_path):
     pytest.importorskip("hatchling")
     command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel"]
     subprocess.run([*command, "--directory", str(tmp_path)], cwd=ROOT, check=True)
@@ -92,7 +92,7 @@ def test_the_wheel_says_that_it_has_types_and_has_every_file_of_the_package(tmp_
     assert files == {name for name in names if name.startswith("skillweave/")}
 
 
-def test_the_versions_that_are_tried_are_those_that_are_promised() -> None:
+def test_the_versions_that_are_tried_are_those_that_are_promised():
     core = {re.split(r"[\[>=<]", r)[0] for r in PROJECT["dependencies"]}
     lowest = dict(pin.split("==") for pin in versions.asked("lowest"))
     assert core - set(versions.LINKED) <= {name.partition("[")[0] for name in lowest}
@@ -102,7 +102,7 @@ def test_the_versions_that_are_tried_are_those_that_are_promised() -> None:
         assert requirement in versions.asked("newest")
 
 
-def test_the_tests_of_versions_are_there() -> None:
+def test_the_tests_of_versions_are_there():
     assert [path for path in versions.TESTS if not (ROOT / path).exists()] == []
     with pytest.raises(ValueError, match="names no lowest version"):
         versions.lowest("numpy<3")

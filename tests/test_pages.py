@@ -13,6 +13,7 @@ from pages import BLOCK, INCLUDED, ROOT, run_page, train_briefly
 from skillweave._internal.public import HOMES
 from skillweave.cli.commands import COMMANDS, name_of
 
+README = ROOT / "README.md"
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 NEEDS = {
     "docs/tutorials/first-hierarchy.md": ("Box2D",),
@@ -30,9 +31,7 @@ def name(page: Path) -> str:
 @pytest.mark.filterwarnings("ignore:start from .* the dict kwargs")  # start-from.md says so
 @pytest.mark.fast_cases(4)
 @pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=name)
-def test_the_code_of_a_page_runs(
-    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     for module in NEEDS.get(name(page), ()):
         pytest.importorskip(module)
     train_briefly(monkeypatch)
@@ -44,20 +43,20 @@ def test_the_code_of_a_page_runs(
         run_page(page, monkeypatch)
 
 
-def test_pages_show_whole_files_that_exist() -> None:
+def test_pages_show_whole_files_that_exist():
     shown = [found for page in PAGES for found in INCLUDED.findall(page.read_text())]
     assert "examples/doorkey.py" in shown
     assert [path for path in shown if not (ROOT / path).is_file()] == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_every_command_of_a_page_exists(page: Path) -> None:
+@pytest.mark.parametrize("page", [README, *PAGES], ids=name)
+def test_every_command_of_a_page_exists(page):
     used = set(re.findall(r"^\s*skillweave ([\w-]+)", page.read_text(), flags=re.M))
     assert used <= {name_of(c) for c in COMMANDS}
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=name)
-def test_modules_that_a_page_tells_to_run_exist(page: Path) -> None:
+@pytest.mark.parametrize("page", [README, *PAGES], ids=name)
+def test_modules_that_a_page_tells_to_run_exist(page):
     modules = re.findall(r"python -m (benchmarks\.\w+)", page.read_text())
     places = {m: ROOT / m.replace(".", "/") for m in modules}
     there = {m for m, p in places.items() if p.with_suffix(".py").is_file()}
@@ -65,7 +64,7 @@ def test_modules_that_a_page_tells_to_run_exist(page: Path) -> None:
     assert [m for m in modules if m not in there] == []
 
 
-def test_every_public_name_stands_in_the_reference_once() -> None:
+def test_every_public_name_stands_in_the_reference_once():
     pages = sorted((ROOT / "docs/reference").glob("*.md"))
     shown = r"^::: (skillweave(?:\.\w+)?)\.(\w+)$"
     found = [place for p in pages for place in re.findall(shown, p.read_text(), flags=re.M)]
@@ -74,11 +73,11 @@ def test_every_public_name_stands_in_the_reference_once() -> None:
 
 
 @pytest.mark.parametrize("page", sorted((ROOT / "docs/suites").glob("*.md")), ids=name)
-def test_a_page_about_a_suite_names_its_command(page: Path) -> None:
+def test_a_page_about_a_suite_names_its_command(page):
     assert "python -m benchmarks.pay" in page.read_text()
 
 
-def test_every_table_of_results_has_its_command() -> None:
+def test_every_table_of_results_has_its_command():
     sections = re.split(r"^## ", (ROOT / "docs/results.md").read_text(), flags=re.M)[1:]
     assert len(sections) >= 6
     assert [s.splitlines()[0] for s in sections if "python -m benchmarks." not in s] == []

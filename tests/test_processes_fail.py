@@ -9,10 +9,10 @@ import sys
 import tempfile
 import time
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from toys import World
 
 import skillweave as sw
 from skillweave.workers import processes
@@ -21,20 +21,11 @@ from skillweave.workers.host import Workers
 SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((4,)))
 
 
-class Ramp(gym.Env):
-    observation_space = gym.spaces.Box(-10.0, 10.0, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return np.array([self.np_random.uniform(-1, 1)], np.float32), {}
-
+class Ramp(World):
     def step(self, action):
-        self.t += 1
-        if self.t == 5 and multiprocessing.parent_process() is not None:
+        if self.t == 4 and multiprocessing.parent_process() is not None:
             self.at_five()
-        return np.array([self.t], np.float32), float(action), self.t >= 8, False, {}
+        return super().step(action)
 
     def at_five(self):
         """Something happens, in processes alone."""
@@ -81,6 +72,7 @@ def test_a_process_that_ends_says_why(what, says, tmp_path):
 def test_an_environment_that_calls_sys_exit_is_an_error(call, workers, tmp_path):
     class Exits(Ramp):
         def __init__(self):
+            super().__init__()
             self.at("__init__")
 
         def reset(self, *, seed=None, options=None):
@@ -185,6 +177,7 @@ def test_without_shared_memory_the_weights_are_the_same(missing, tmp_path, monke
 def test_an_environment_in_a_process_may_have_processes(tmp_path):
     class Simulator(Ramp):
         def __init__(self):
+            super().__init__()
             context = multiprocessing.get_context("fork")
             self.other = context.Process(target=time.sleep, args=(100,))
             self.other.start()

@@ -8,10 +8,9 @@ import sys
 import time
 from pathlib import Path
 
-import gymnasium as gym
-import numpy as np
 import pytest
 from living import all_end
+from toys import World
 
 import skillweave as sw
 
@@ -19,30 +18,20 @@ SMALL = sw.PPO(num_envs=2, n_steps=16, batch_size=32, update_epochs=1, network=s
 FORK = multiprocessing.get_context("fork")
 
 
-class Simulated(gym.Env):
+class Simulated(World):
     """Has a process, whose number stands in a file of ``folder``."""
 
-    observation_space = gym.spaces.Box(-20, 20, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
     folder: Path
     daemon = True
 
     def __init__(self):
+        super().__init__()
         self.simulator = FORK.Process(target=self.simulate, daemon=self.daemon)
         self.simulator.start()
         (self.folder / str(self.simulator.pid)).touch()
 
     def simulate(self):
         time.sleep(30)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.t += 1
-        return np.zeros(1, np.float32), float(action), self.t == 8, False, {}
 
 
 class Terminating(Simulated):
@@ -98,6 +87,7 @@ class Killed(Simulated):
     """Is killed once, in its second step, with a process that no module of Python waits for."""
 
     def __init__(self):
+        World.__init__(self)
         self.simulator = subprocess.Popen(["sleep", "30"])
         (self.folder / str(self.simulator.pid)).touch()
 

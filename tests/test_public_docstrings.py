@@ -10,7 +10,6 @@ import textwrap
 from collections.abc import Iterator
 from enum import IntEnum
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -123,7 +122,7 @@ NAMES = [name for name in THINGS if name not in ALIASES]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_public_name_says_all_that_a_user_needs(name: str) -> None:
+def test_a_public_name_says_all_that_a_user_needs(name):
     found = {where: lacks for where, thing in public_functions(name) if (lacks := missing(thing))}
     assert found == {}
 
@@ -132,7 +131,7 @@ DATACLASSES = [kind for n in NAMES if dataclasses.is_dataclass(kind := THINGS[n]
 
 
 @pytest.mark.parametrize("kind", [*DATACLASSES, *COMMANDS], ids=lambda kind: kind.__name__)
-def test_every_field_of_a_public_dataclass_is_explained(kind: Any) -> None:
+def test_every_field_of_a_public_dataclass_is_explained(kind):
     """By the text under it, by the comment beside it, or by the class; ``--help`` shows it, too."""
     said = set[str]()
     for base in kind.__mro__:
@@ -156,20 +155,18 @@ def test_every_field_of_a_public_dataclass_is_explained(kind: Any) -> None:
 EXAMPLES = {name: text for name in NAMES if (text := example_of(name))}
 
 
-def test_some_public_names_have_an_example() -> None:
+def test_some_public_names_have_an_example():
     assert {"Hierarchy", "Player", "Automaton", "tree", "gae"} <= set(EXAMPLES)
 
 
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
-def test_an_example_in_a_docstring_runs(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_example_in_a_docstring_runs(name, tmp_path, monkeypatch):
     train_briefly(monkeypatch)
     monkeypatch.chdir(tmp_path)
     exec(compile(EXAMPLES[name], f"example of {name}", "exec", dont_inherit=True), {})
 
 
-def test_what_is_missing_is_found() -> None:
+def test_what_is_missing_is_found():
     def bad(size: int, obs: Array) -> Array:
         """Makes."""
         if size < 0:

@@ -66,23 +66,23 @@ GOOD: dict[str, Any] = {"parts": [{"status": "done"}], "limit": None}
         ({"on": 1}, "on is 1; it must be true or false"),
     ],
 )
-def test_what_does_not_fit_is_told_by_its_field(change: dict[str, Any], says: str) -> None:
+def test_what_does_not_fit_is_told_by_its_field(change, says):
     with pytest.raises(RunError) as caught:
         fit(Outer, GOOD | change, "x.json")
     assert says in str(caught.value)
     assert len(str(caught.value)) < 200
 
 
-def test_large_numbers_that_fit_into_64_bits_can_be_declared() -> None:
+def test_large_numbers_that_fit_into_64_bits_can_be_declared():
     assert fitted(Count, 2**62, "PPO.num_envs") == 2**62
 
 
-def test_what_fits_comes_back_with_dataclasses_made_and_other_fields_kept() -> None:
+def test_what_fits_comes_back_with_dataclasses_made_and_other_fields_kept():
     data = GOOD | {"made": {"sizes": [1, 2], "pair": [3, 4]}, "new": 5}
     assert fit(Outer, data, "x.json") == data | {"made": Made((1, 2), (3, 4))}
 
 
-def test_a_long_value_is_shown_short() -> None:
+def test_a_long_value_is_shown_short():
     assert len(shown("x" * 10_000)) == 60
     assert shown(10**5000) == "a int"
     deep: list[Any] = []
@@ -95,7 +95,7 @@ def test_a_long_value_is_shown_short() -> None:
 
 
 @pytest.mark.parametrize("value", [5, "a", [[]], {"a": 1}, float("inf")])
-def test_an_evolution_of_wrong_types_is_told_by_its_field(value: Any) -> None:
+def test_an_evolution_of_wrong_types_is_told_by_its_field(value):
     data = evolution_to_json(Evolution())
     for name in ("population", "selection", "mutations", "start"):
         if name == "population" and value == 5:
@@ -115,7 +115,7 @@ def test_an_evolution_of_wrong_types_is_told_by_its_field(value: Any) -> None:
     ["[" * 5000 + "]" * 5000, "[" * 500 + "]" * 500, "NaN", "[1e999]", b"\xff", "9" * 5000, "{"],
     ids=["very deep", "deep", "nan", "infinite", "not UTF-8", "many digits", "cut off"],
 )
-def test_json_that_could_not_be_written_is_damaged(text: str | bytes) -> None:
+def test_json_that_could_not_be_written_is_damaged(text):
     with pytest.raises(RunError, match=r"x\.json is damaged"):
         parse_json(text, "x.json")
 
@@ -125,22 +125,22 @@ def test_json_that_could_not_be_written_is_damaged(text: str | bytes) -> None:
     ['["\\ud800"]', '{"a": {"\\udc00": 1}}', '["\ud800"]', b'["\xed\xa0\x80"]',
      '["\\ud800"]'.encode("utf-16-le")],
 )  # fmt: skip
-def test_half_a_character_in_json_is_damage(text: str | bytes) -> None:
+def test_half_a_character_in_json_is_damage(text):
     with pytest.raises(RunError, match=r"x\.json is damaged: .* half of a character"):
         parse_json(text, "x.json")
 
 
 @pytest.mark.parametrize("text", ['["\\ud83d\\ude00"]', '["😀"]', '["😀"]'.encode()])
-def test_whole_characters_in_json_are_read_however_they_are_written(text: str | bytes) -> None:
+def test_whole_characters_in_json_are_read_however_they_are_written(text):
     assert parse_json(text, "x.json") == ["😀"]
 
 
-def test_json_may_be_nested_up_to_a_limit() -> None:
+def test_json_may_be_nested_up_to_a_limit():
     depth = DEEPEST - 1
     assert str(parse_json("[" * depth + "1" + "]" * depth, "x")).count("[") == depth
 
 
-def test_what_is_no_plain_file_is_refused_at_once(tmp_path: Path) -> None:
+def test_what_is_no_plain_file_is_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to("/dev/zero")
     for path, says in (
@@ -154,7 +154,7 @@ def test_what_is_no_plain_file_is_refused_at_once(tmp_path: Path) -> None:
             check_file(path)
 
 
-def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
+def test_a_file_that_is_too_large_is_not_read(tmp_path):
     with (tmp_path / "x").open("wb") as file:
         file.truncate(10**12)
     with pytest.raises(RunError, match=r"1,000,000,000,000 bytes.*at most 100"):
@@ -163,6 +163,6 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", [PPO, DQN])
 @pytest.mark.parametrize("compile", [True, False, "auto"])
-def test_a_setting_that_is_yes_no_or_a_word_comes_back_from_json(kind: Any, compile: Any) -> None:
+def test_a_setting_that_is_yes_no_or_a_word_comes_back_from_json(kind, compile):
     again: Any = config_from_json(config_to_json(kind(compile=compile)))
     assert again.compile is compile or again.compile == compile == "auto"

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from toys import World
 
 import skillweave as sw
 from skillweave.algorithms import register_algorithm
@@ -17,29 +18,16 @@ from skillweave.errors import DeclarationError
 SMALL = sw.PPO(num_envs=2, n_steps=8)
 
 
-class Arena(gym.Env):
-    """Is made with anything."""
-
-    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
+class Arena(World):
+    """Is made with anything; pays if it was."""
 
     def __init__(self, sizes=None):
+        super().__init__()
         self.sizes = sizes
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self.observation_space.sample(), {}
-
     def step(self, action):
-        self.t += 1
-        return (
-            self.observation_space.sample(),
-            float(self.sizes is not None),
-            False,
-            self.t == 5,
-            {},
-        )
+        obs, _, *end = super().step(action)
+        return obs, float(self.sizes is not None), *end
 
 
 class Stay(sw.Skill):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -122,15 +122,24 @@ def declare(*skills: sw.Skill, algorithm: Any = ON, steps: int = STEPS, **how: A
     return sw.Hierarchy(SPEC, skills, algorithm=algorithm, **settings | how)
 
 
-@pytest.fixture(autouse=True)
-def _small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(repair, "CHUNK", 1_500)
-    monkeypatch.setattr(repair, "ENOUGH_STEPS", 3_000)
+@pytest.fixture(autouse=True, scope="module")
+def _small() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(repair, "CHUNK", 1_500)
+        patch.setattr(repair, "ENOUGH_STEPS", 3_000)
+        yield
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return declare().train(tmp_path_factory.mktemp("runs") / "buttons", quiet=True)
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run of a skill that cannot become better."""
+    folder = tmp_path_factory.mktemp("runs")
+    return declare(Wrong(), Flip(), steps=512).train(folder / "wrong", quiet=True)
 
 
 def repaired(run: Run, path: Path | None, **how: Any) -> Run:
@@ -144,7 +153,7 @@ def weights(run: Run) -> dict[str, Any]:
     return {k: v.tolist() for k, v in run.policy.skills.policies[0].weights.items()}
 
 
-def test_a_skill_learns_to_go_on_from_where_the_other_ends(run: Run, tmp_path: Path) -> None:
+def test_a_skill_learns_to_go_on_from_where_the_other_ends(run, tmp_path):
     new = repaired(run, tmp_path / "new")
     (result,) = new.repairs
     assert result.before.of("press", "flip")[0] < 0.2
@@ -172,8 +181,8 @@ def test_a_skill_learns_to_go_on_from_where_the_other_ends(run: Run, tmp_path: P
 @pytest.mark.slow
 @pytest.mark.parametrize("rehearses", [True, False])
 def test_a_repaired_skill_keeps_its_other_starts_by_rehearsal(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rehearses: bool
-) -> None:
+    run, tmp_path, monkeypatch, rehearses
+):
     # All episodes start after the other skill, so nothing else keeps what was learnt at the start.
     monkeypatch.setattr(repair, "REHEARSED_SHARE", 1.0)
     if not rehearses:
@@ -185,7 +194,7 @@ def test_a_repaired_skill_keeps_its_other_starts_by_rehearsal(
     assert kept > 0.9 if rehearses else kept < 0.5
 
 
-def test_observations_of_done_calls_are_rehearsed(run: Run) -> None:
+def test_observations_of_done_calls_are_rehearsed(run):
     log = record_calls(SPEC, run.policy, 600, num_envs=4)
     skill = run.hierarchy.skill("press")
     obs = repair.rehearsed_obs(log, skill, None, "flip", None)
@@ -204,7 +213,7 @@ class Swapped(Press):
     name, sees = "press", (1, 0)
 
 
-def test_what_a_skill_rehearses_is_its_part(tmp_path: Path) -> None:
+def test_what_a_skill_rehearses_is_its_part(tmp_path):
     first = declare(Swapped(), Flip(), steps=512).train(tmp_path / "run", quiet=True)
     done = {"press": lambda obs: obs[:, 1] >= 0}
     log = record_calls(SPEC, first.policy, 600, num_envs=4)
@@ -247,7 +256,7 @@ def steps_to(*counts: int) -> sw.Step:
     [(Stay(), [0.5, 2.5, 2.5, 10.5]), (Press(), [2.0, 13.0, 13.0, 13.0])],
     ids=["goes on", "ends by it"],
 )
-def test_an_eager_skill_is_paid_while_its_event_holds(skill: sw.Skill, rewards: Any) -> None:
+def test_an_eager_skill_is_paid_while_its_event_holds(skill, rewards):
     holds = repair.event_of(skill, None)
     assert holds is not None
     twin = repair.eager(skill, holds, bonus=2.0, rest=10.0)
@@ -257,7 +266,7 @@ def test_an_eager_skill_is_paid_while_its_event_holds(skill: sw.Skill, rewards: 
     assert skill.defines("reward") == isinstance(skill, Press), "the skill itself stays as it is"
 
 
-def test_the_event_of_a_repair_is_the_callers_or_success() -> None:
+def test_the_event_of_a_repair_is_the_callers_or_success():
     step = steps_to(1, 3)
     for event in (held(lambda obs: obs[:, 1] == 1, 50), lambda obs: obs[:, 1] == 1):
         holds = repair.event_of(Press(), {"press": event})
@@ -268,7 +277,7 @@ def test_the_event_of_a_repair_is_the_callers_or_success() -> None:
     assert holds(step).tolist() == [False, True]
 
 
-def test_calls_of_a_repair_have_the_selectors_limit() -> None:
+def test_calls_of_a_repair_have_the_selectors_limit():
     roles = roles_of(declare(Press(), Flip(), call_steps=5))
     policies = {name: RandomChoice(3) for name in roles.skills}
     entry = RepairEntry("press", "flip", 20, [], "", Matrix([], [], [], [], []))
@@ -278,22 +287,18 @@ def test_calls_of_a_repair_have_the_selectors_limit() -> None:
     assert collector.limit == 5, "of 8 by itself"
 
 
-def test_what_is_not_better_is_not_kept(tmp_path: Path) -> None:
-    first = declare(Wrong(), Flip(), steps=512).train(tmp_path / "run", quiet=True)
-    new = repaired(first, tmp_path / "new", **SHORT)
+def test_what_is_not_better_is_not_kept(wrong, tmp_path):
+    new = repaired(wrong, tmp_path / "new", **SHORT)
     (result,) = new.repairs
     assert not result.kept
     assert result.sentence.endswith("not clearly better, so the earlier weights are kept")
     again = sw.load(new.path, declare(Wrong(), Flip()))
-    assert weights(first) == weights(new) == weights(again)
+    assert weights(wrong) == weights(new) == weights(again)
 
 
-def test_measuring_stops_and_says_what_was_not_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_measuring_stops_and_says_what_was_not_measured(wrong, tmp_path, monkeypatch):
     monkeypatch.setattr(repair, "MOST_STEPS", 4_000)
-    first = declare(Wrong(), Flip(), steps=512).train(tmp_path / "run", quiet=True)
-    (result,) = repaired(first, tmp_path / "new", **SHORT | {"calls": 100_000}).repairs
+    (result,) = repaired(wrong, tmp_path / "new", **SHORT | {"calls": 100_000}).repairs
     stopped = (
         r"Measuring stopped after 4,\d+ steps: 100,000 calls of press after flip were wanted, and "
         r"there were \d+; flip was done in [\d,]+ of [\d,]+ calls\.$"
@@ -302,9 +307,7 @@ def test_measuring_stops_and_says_what_was_not_measured(
     assert re.search(r"so the earlier weights are kept\. " + stopped, result.sentence)
 
 
-def test_a_pair_that_is_seldom_called_is_given_up(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pair_that_is_seldom_called_is_given_up(run, tmp_path, monkeypatch):
     monkeypatch.setattr(repair, "LARGEST_CHUNK", 1_500)
     monkeypatch.setattr(repair, "FEWEST", 50_000)
     monkeypatch.setattr(repairing, "FEWEST", 50_000)
@@ -329,25 +332,19 @@ def matrix(*rows: tuple[float, float]) -> Handover:
         (((0.9, 0.9), (0.9, 0.8), (0.9, 0.9)), True, "no other pair is clearly worse"),
         (((0.9, 0.9), (0.9, 0.3), (0.9, 0.9)), False, "b after a: 20% of 100 calls"),
         (((0.9, 0.9), (0.9, 0.0), (0.9, 0.9)), False, "not clearly better"),
-        (
-            ((0.9, 0.6), (0.9, 0.8), (0.9, 0.9)),
-            False,
-            "b after start: 90% of 100 calls",
-        ),
+        (((0.9, 0.6), (0.9, 0.8), (0.9, 0.9)), False, "b after start: 90% of 100 calls"),
         (((0.9, 0.9), (0.9, 0.8), (0.6, 0.9)), False, "a after b: 90% of 100 calls"),
         (((0.9, 0.85), (0.9, 0.8), (0.9, 0.9)), True, "b after a: 20%"),
     ],
 )
-def test_a_repair_is_kept_if_the_pair_is_better_and_no_other_worse(
-    later: Any, kept: bool, says: str
-) -> None:
+def test_a_repair_is_kept_if_the_pair_is_better_and_no_other_worse(later, kept, says):
     before = matrix((0.9, 0.9), (0.9, 0.2), (0.9, 0.9))
     found, sentence = repair.verdict(before, matrix(*later), "b", "a")
     assert found == kept
     assert says in sentence
 
 
-def test_a_few_calls_suffice_to_see_that_all_is_forgotten() -> None:
+def test_a_few_calls_suffice_to_see_that_all_is_forgotten():
     before = matrix((0.9, 0.9), (0.9, 0.2), (0.9, 0.9))
     few = dataclasses.replace(before, calls=before.calls.copy(), done=before.done.copy())
     few.calls[0, 0] = few.done[0, 0] = 8
@@ -361,22 +358,21 @@ SHORT = {"steps": 1_024, "calls": 5}
 """Too few steps to become better."""
 
 
-def stop_at(report: int) -> Callable[[Any], None]:
-    left = [report]
+def stop(event: Any) -> None:
+    if event.steps >= 512:
+        raise KeyboardInterrupt
 
-    def callback(event: Any) -> None:
-        left[0] -= 1
-        if not left[0]:
-            raise KeyboardInterrupt
 
-    return callback
+@pytest.fixture(scope="module")
+def whole(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A repair that was not stopped."""
+    return repaired(run, tmp_path_factory.mktemp("runs") / "whole", **SHORT)
 
 
 @pytest.mark.parametrize("by", ["hierarchy", "repair"])
-def test_a_stopped_repair_ends_with_the_same_weights(run: Run, tmp_path: Path, by: str) -> None:
-    whole = repaired(run, tmp_path / "whole", **SHORT)
+def test_a_stopped_repair_ends_with_the_same_weights(run, whole, tmp_path, by):
     with pytest.raises(Interrupted, match=r'run\.repair\("press", after="flip", run_dir='):
-        repaired(run, tmp_path / "part", callback=stop_at(3), **SHORT)
+        repaired(run, tmp_path / "part", callback=stop, **SHORT)
     assert not RunDirectory.open(tmp_path / "part").finished
     if by == "repair":
         new = repaired(run, tmp_path / "part", resume=True)
@@ -386,19 +382,14 @@ def test_a_stopped_repair_ends_with_the_same_weights(run: Run, tmp_path: Path, b
     assert new.repairs[0].sentence == whole.repairs[0].sentence
 
 
-def test_a_repair_that_was_stopped_while_it_was_measured_goes_on(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = repaired(run, tmp_path / "whole", **SHORT)
-    judge = repair.verdict
-
+def test_a_repair_that_was_stopped_while_it_was_measured_goes_on(run, whole, tmp_path, monkeypatch):
     def stopped(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(repair, "verdict", stopped)
-    with pytest.raises(Interrupted):
-        repaired(run, tmp_path / "part", **SHORT)
-    monkeypatch.setattr(repair, "verdict", judge)
+    with monkeypatch.context() as patch:
+        patch.setattr(repair, "verdict", stopped)
+        with pytest.raises(Interrupted):
+            repaired(run, tmp_path / "part", **SHORT)
     stages = RunDirectory.open(tmp_path / "part").manifest.stages
     assert all(entry.done for entry in stages)
     with pytest.raises(RunError, match=r"run\.repair"):
@@ -406,13 +397,13 @@ def test_a_repair_that_was_stopped_while_it_was_measured_goes_on(
     assert_same(declare().resume(tmp_path / "part", quiet=True).path, whole.path)
 
 
-def test_events_of_the_caller_judge_and_are_needed_again(run: Run, tmp_path: Path) -> None:
+def test_events_of_the_caller_judge_and_are_needed_again(run, tmp_path):
     done = {"press": lambda obs: obs[:, 1] >= 0}
     with pytest.raises(DeclarationError, match="nothing to repair"):
         repaired(run, tmp_path / "a", done=done)
     done = {"press": at_goal}
     with pytest.raises(Interrupted, match="done=…"):
-        repaired(run, tmp_path / "b", done=done, callback=stop_at(2), **SHORT)
+        repaired(run, tmp_path / "b", done=done, callback=stop, **SHORT)
     with pytest.raises(RunError, match=r"is judged by done= of press, which is code: continue"):
         declare().resume(tmp_path / "b", quiet=True)
     assert len(repaired(run, tmp_path / "b", done=done, resume=True).repairs) == 1
@@ -420,25 +411,21 @@ def test_events_of_the_caller_judge_and_are_needed_again(run: Run, tmp_path: Pat
         repaired(run, tmp_path / "c", done={"zero": at_goal})
 
 
-def test_a_repaired_run_is_repaired_again(run: Run, tmp_path: Path) -> None:
-    first = repaired(run, tmp_path / "first", **SHORT | {"steps": 256})
+def test_a_weights_file_is_repaired_and_a_repaired_run_again(run, tmp_path):
+    run.save_weights(tmp_path / "buttons.safetensors")
+    loaded = declare().load_weights(tmp_path / "buttons.safetensors")
+    first = repaired(loaded, tmp_path / "first", **SHORT | {"steps": 256})
+    assert len(first.repairs) == 1
+    assert weights(sw.load(tmp_path / "first", declare())) == weights(first)
+    assert not loaded.repairs
     second = repaired(first, tmp_path / "second", **SHORT)
     assert [r.kept for r in second.repairs] == [False, False]
     names = [entry["name"] for entry in second.info()["stages"]]
     assert names == ["press", "press-repair", "press-repair-2"]
 
 
-def test_a_weights_file_is_repaired(run: Run, tmp_path: Path) -> None:
-    run.save_weights(tmp_path / "buttons.safetensors")
-    loaded = declare().load_weights(tmp_path / "buttons.safetensors")
-    new = repaired(loaded, tmp_path / "new", **SHORT)
-    assert len(new.repairs) == 1
-    assert weights(sw.load(tmp_path / "new", declare())) == weights(new)
-    assert not loaded.repairs
-
-
 @pytest.mark.slow
-def test_a_skill_of_dqn_is_repaired_too(tmp_path: Path) -> None:
+def test_a_skill_of_dqn_is_repaired_too(tmp_path):
     off = sw.DQN(
         num_envs=4, batch_size=32, learning_starts=200, buffer_size=4_000, gamma=0.9,
         learning_rate=3e-3, update_ratio=0.25, exploration_fraction=0.4,
@@ -451,7 +438,7 @@ def test_a_skill_of_dqn_is_repaired_too(tmp_path: Path) -> None:
     assert again.repairs[0].sentence == new.repairs[0].sentence
 
 
-def test_a_skill_inside_another_hierarchy_is_repaired(tmp_path: Path) -> None:
+def test_a_skill_inside_another_hierarchy_is_repaired(tmp_path):
     def nested() -> sw.Hierarchy:
         inner = declare().as_skill("inner", max_steps=60)
         outer = declare(Flip())
@@ -484,12 +471,12 @@ def test_a_skill_inside_another_hierarchy_is_repaired(tmp_path: Path) -> None:
         ({"resume": True}, "resume=True continues a repair, so name its directory"),
     ],
 )
-def test_what_cannot_be_repaired_is_said(run: Run, how: dict[str, Any], says: str) -> None:
+def test_what_cannot_be_repaired_is_said(run, how, says):
     with pytest.raises(DeclarationError, match=says):
         repaired(run, None, **how)
 
 
-def test_runs_that_cannot_be_repaired(run: Run, tmp_path: Path) -> None:
+def test_runs_that_cannot_be_repaired(run, tmp_path):
     planned = run.plan(Mission(at_goal), run.log_calls(500))
     with pytest.raises(RunError, match="was planned"):
         repaired(planned, tmp_path / "a")
@@ -505,13 +492,13 @@ def test_runs_that_cannot_be_repaired(run: Run, tmp_path: Path) -> None:
         repaired(never, tmp_path / "a", after="never")
 
 
-def test_start_calls_by_name_are_checked_and_recorded(tmp_path: Path) -> None:
+def test_start_calls_by_name_are_checked_and_recorded(tmp_path):
     with pytest.raises(DeclarationError, match="start_calls names 'flop', which is no skill here"):
         declare(apart=sw.Apart(start_calls=("flop",)))
     for wrong in ((), "flip", ("flip", 3)):
         with pytest.raises(DeclarationError, match="start_calls"):
-            sw.Apart(start_calls=wrong)  # type: ignore[arg-type]
-    apart = sw.Apart(skill_steps=1_024, start_calls=["flip"])  # type: ignore[arg-type]
+            sw.Apart(start_calls=wrong)
+    apart = sw.Apart(skill_steps=1_024, start_calls=["flip"])
     assert apart.start_calls == ("flip",)
     run = declare(apart=apart).train(tmp_path / "run", quiet=True)
     assert run.info()["hierarchy"]["start_calls"] == ["flip"]

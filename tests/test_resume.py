@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import multiprocessing
 import shutil
 import signal
@@ -12,35 +10,27 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from small_runs import (
     StopAt,
     Stopped,
-    assert_metrics_fit,
     assert_same,
     lines,
     new_run,
     policies,
     reports_every,
-    small_manifest,
     stopped_run,
 )
-from toys import ASKS, Echo
 
-from skillweave import DQN, SAC, TD3, Hierarchy, Network, recipes
+from skillweave import Hierarchy, recipes
 from skillweave.cli import main
 from skillweave.cli.overrides import apply_overrides
-from skillweave.experience.learners import Alone
 from skillweave.hierarchy import training
 from skillweave.hierarchy.roles import roles_of
 from skillweave.runs.directory import RunDirectory
-from skillweave.training.learning_task import LearningTask
 from skillweave.training.replay_learner import ReplayLearner
-from skillweave.training.stage import Stage
-from skillweave.training.trainer import Course, train_stage
 
 often = reports_every(75)
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")  # EnvPool's CartPole
@@ -116,29 +106,22 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Reference:
 # Two uninterrupted runs
 
 
-@pytest.mark.slow
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("engine", ENGINES)
-def test_the_same_seed_gives_the_same_weights_and_another_seed_others(
-    tmp_path: Path, reference: Reference, engine: str
-) -> None:
+def test_the_same_seed_gives_the_same_files_byte_by_byte_and_another_seed_other_weights(
+    tmp_path, reference, engine
+):
     recipe, whole = reference(engine)
     recipes.load(str(recipe)).train(tmp_path / "again", seed=3, quiet=True)
     assert_same(tmp_path / "again", whole)
+    for path in (whole / "policies").iterdir():
+        assert (tmp_path / "again" / "policies" / path.name).read_bytes() == path.read_bytes()
     recipes.load(str(recipe)).train(tmp_path / "other", seed=4, quiet=True)
     mine, theirs = policies(tmp_path / "other"), policies(whole)
     assert all(mine[name][1] != theirs[name][1] for name in theirs)
 
 
-def test_the_files_of_two_equal_runs_are_equal_byte_by_byte(
-    tmp_path: Path, reference: Reference
-) -> None:
-    recipe, whole = reference("sync")
-    recipes.load(str(recipe)).train(tmp_path / "again", seed=3, quiet=True)
-    for path in (whole / "policies").iterdir():
-        assert (tmp_path / "again" / "policies" / path.name).read_bytes() == path.read_bytes()
-
-
-def test_the_recipe_is_worth_interrupting(reference: Reference) -> None:
+def test_the_recipe_is_worth_interrupting(reference):
     _, whole = reference("sync")
     found = lines(whole)
     assert {r["stage"] for r in found} == {"left", "balance", "selector"}
@@ -155,9 +138,7 @@ def test_the_recipe_is_worth_interrupting(reference: Reference) -> None:
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("tick", [1, 7, 10, 12, 15, 21, 24])
-def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(
-    tmp_path: Path, reference: Reference, engine: str, tick: int
-) -> None:
+def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, reference, engine, tick):
     recipe, whole = reference(engine)
     run = stopped_run(recipes.load(str(recipe)), tmp_path / "run", tick)
     assert not run.finished
@@ -166,28 +147,7 @@ def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(
 
 
 @pytest.mark.slow
-def test_a_run_stopped_again_and_again_ends_as_if_it_had_not_been(
-    tmp_path: Path, reference: Reference
-) -> None:
-    recipe, whole = reference("sync")
-    path = stopped_run(recipes.load(str(recipe)), tmp_path / "run", 5).path
-    stops = 1
-    while True:
-        run = RunDirectory.open(path)
-        try:
-            # As many ticks as reach the next checkpoint, but not the one after it.
-            training.train(recipes.load(str(recipe)), run, (StopAt(4),))
-            break
-        except Stopped:
-            stops += 1
-        finally:
-            run.close()
-    assert stops >= 4
-    assert_same(path, whole)
-
-
-@pytest.mark.slow
-def test_a_flat_run_stopped_in_the_middle_ends_as_if_it_had_not_been(tmp_path: Path) -> None:
+def test_a_flat_run_stopped_in_the_middle_ends_as_if_it_had_not_been(tmp_path):
     recipe = str(write_recipe(tmp_path))
     recipes.load(recipe).train(tmp_path / "whole", seed=3, flat=True, quiet=True)
     run = stopped_run(recipes.load(recipe), tmp_path / "run", 20, flat=True)
@@ -197,8 +157,8 @@ def test_a_flat_run_stopped_in_the_middle_ends_as_if_it_had_not_been(tmp_path: P
 
 @pytest.mark.slow
 def test_a_run_with_networks_of_the_usual_size_ends_as_if_it_had_not_been_stopped(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     # Where a tensor lies in memory changes the last bit of large matrix products only.
     pytest.importorskip("Box2D")
 
@@ -219,9 +179,7 @@ def test_a_run_with_networks_of_the_usual_size_ends_as_if_it_had_not_been_stoppe
     assert_same(run.path, tmp_path / "whole")
 
 
-def test_a_run_with_a_damaged_checkpoint_goes_on_from_the_one_before(
-    tmp_path: Path, reference: Reference
-) -> None:
+def test_a_run_with_a_damaged_checkpoint_goes_on_from_the_one_before(tmp_path, reference):
     recipe, whole = reference("sync")
     path = stopped_run(recipes.load(str(recipe)), tmp_path / "run", 16).path
     assert (path / "checkpoint.previous.safetensors").exists()
@@ -233,8 +191,8 @@ def test_a_run_with_a_damaged_checkpoint_goes_on_from_the_one_before(
 
 @pytest.mark.slow
 def test_a_run_killed_between_its_last_checkpoint_and_its_policy_loses_nothing(
-    tmp_path: Path, reference: Reference, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, reference, monkeypatch
+):
     recipe, whole = reference("sync")
     path = tmp_path / "run"
 
@@ -253,7 +211,7 @@ def test_a_run_killed_between_its_last_checkpoint_and_its_policy_loses_nothing(
     assert mine.final["policy_loss"] == theirs.final["policy_loss"]
 
 
-def test_resuming_a_finished_run_changes_no_file(tmp_path: Path, reference: Reference) -> None:
+def test_resuming_a_finished_run_changes_no_file(tmp_path, reference):
     recipe, whole = reference("sync")
     shutil.copytree(whole, tmp_path / "run")
     before = {p: p.read_bytes() for p in (tmp_path / "run").rglob("*.*")}
@@ -283,9 +241,7 @@ SETTINGS = [  # a run that lost any of them would end otherwise
 
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", SETTINGS)
-def test_settings_changed_for_a_run_stay_changed_when_it_is_resumed(
-    tmp_path: Path, settings: list[str]
-) -> None:
+def test_settings_changed_for_a_run_stay_changed_when_it_is_resumed(tmp_path, settings):
     recipe = str(write_recipe(tmp_path))
 
     def changed() -> Hierarchy:
@@ -299,9 +255,7 @@ def test_settings_changed_for_a_run_stay_changed_when_it_is_resumed(
     assert_same(run.path, tmp_path / "whole")
 
 
-def test_a_run_whose_skills_have_rewards_of_their_own_is_not_resumed_without_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_whose_skills_have_rewards_of_their_own_is_not_resumed_without_them(tmp_path, capsys):
     # Acting needs none of this recipe's code, but finishing the training does.
     recipe = tmp_path / "rewards.py"
     text = RECIPE.replace(', engine="ENGINE"', "").replace("def initiation", "def _unused")
@@ -312,124 +266,6 @@ def test_a_run_whose_skills_have_rewards_of_their_own_is_not_resumed_without_the
     assert main(["resume", str(run.path), "--quiet", "--evaluate", "0"]) == 1
     assert "--recipe" in capsys.readouterr().err
     assert not RunDirectory.open(run.path).finished
-
-
-# What learns from a replay buffer
-
-
-REPLAY: dict[str, Any] = {
-    "num_envs": 4, "batch_size": 8, "learning_starts": 40, "buffer_size": 200, "update_ratio": 0.25,
-    "network": Network((8,), "relu"), "normalize_rewards": True,
-}  # fmt: skip
-REPLAYERS = {
-    "dqn": (DQN(**REPLAY), "dict", "Discrete"),
-    "rainbow": (DQN.rainbow(**REPLAY), "discrete", "Discrete"),
-    "td3": (TD3(**REPLAY, normalize_obs=True), "vector", "Box"),
-    "sac": (SAC(**REPLAY, normalize_obs=True), "tuple", "Box"),
-    "sac beside collecting": (SAC(**REPLAY, overlap=True), "vector", "Box"),
-    "sac of choices": (SAC(**REPLAY), "image, channels first", "Discrete"),
-}
-
-
-class EchoTask(LearningTask):
-    """Its environments are a toy."""
-
-    def engine(self, num_envs: int, first: int = 0) -> Any:
-        return self.role.spec.made(num_envs)  # type: ignore[attr-defined]
-
-
-def stage_of(name: str, save_buffer: bool = True) -> Stage:
-    config, shows, asks = REPLAYERS[name]
-    config = dataclasses.replace(config, save_buffer=save_buffer)
-
-    def learning_task(_: Any) -> LearningTask:
-        spaces = Echo(1, shows, asks).observation_space, ASKS[asks][0]
-        spec = SimpleNamespace(name="Echo", made=lambda n: Echo(n, shows, asks))
-        role: Any = SimpleNamespace(
-            spec=spec, spaces=spaces, row_steps=1, margin=None, guide_kl=None
-        )
-        return EchoTask(role, Alone())
-
-    return Stage("echo", "agent", config, 650, learning_task)
-
-
-def echo_run(path: Path, stage: Stage) -> RunDirectory:
-    manifest = small_manifest(stage.entry(), env="Echo", seed=3, checkpoint_every=125)
-    return RunDirectory.create(path, manifest)
-
-
-REPORTED_AT = [76, 152, 228, 300, 376, 452, 528, 600, 652]
-
-
-def train_echo(run: RunDirectory, stage: Stage, *listeners: Any) -> None:
-    try:
-        train_stage(stage, Course(run, listeners), {})
-    finally:
-        run.close()
-
-
-@pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", REPLAYERS)
-def test_a_run_with_a_replay_buffer_ends_as_if_it_had_not_been_stopped(
-    tmp_path: Path, name: str
-) -> None:
-    stage = stage_of(name)
-    train_echo(echo_run(tmp_path / "whole", stage), stage)
-    run = echo_run(tmp_path / "run", stage)
-    for stop in (3, 4):  # a checkpoint every 125 steps
-        with pytest.raises(Stopped):
-            train_echo(run, stage, StopAt(stop))
-        run = RunDirectory.open(run.path)
-        assert (run.path / "checkpoint.safetensors").exists()
-    train_echo(run, stage)
-    assert policies(run.path) == policies(tmp_path / "whole")
-    assert [r["steps"] for r in lines(run.path)] == REPORTED_AT
-    assert_metrics_fit(run.path, tmp_path / "whole")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["rainbow", "sac"])
-def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(
-    tmp_path: Path, name: str
-) -> None:
-    stage = stage_of(name, save_buffer=False)
-    train_echo(echo_run(tmp_path / "whole", stage), stage)
-    run = echo_run(tmp_path / "run", stage)
-    with pytest.raises(Stopped):
-        train_echo(run, stage, StopAt(3))
-    with_buffer = echo_run(tmp_path / "bigger", stage_of(name))
-    with pytest.raises(Stopped):
-        train_echo(with_buffer, stage_of(name), StopAt(3))
-    sizes = [(r.path / "checkpoint.safetensors").stat().st_size for r in (run, with_buffer)]
-    assert sizes[0] < sizes[1]
-    train_echo(RunDirectory.open(run.path), stage)
-    assert RunDirectory.open(run.path).finished
-    mine, theirs = policies(run.path), policies(tmp_path / "whole")
-    assert mine["echo.safetensors"][1] != theirs["echo.safetensors"][1]
-    assert [r["steps"] for r in lines(run.path)] == REPORTED_AT
-
-
-@pytest.mark.slow
-def test_a_hierarchy_that_learns_from_replay_ends_as_if_it_had_not_been_stopped(
-    tmp_path: Path,
-) -> None:
-    text = RECIPE.replace(', engine="ENGINE"', "").replace("Left.algorithm = moving\n", "")
-    text = text.replace("Apart, Network, PPO,", "Apart, DQN, SAC, Network, PPO,")
-    replay = "num_envs=4, learning_starts=40, buffer_size=300, batch_size=8, update_ratio=0.25"
-    replay += ", network=Network((8,))"
-    text = text.replace("    algorithm=small,", f"    algorithm=DQN.rainbow({replay}),")
-    text = text.replace("    selector=small,", f"    selector=SAC({replay}),")
-    (tmp_path / "replay.py").write_text(text)
-    recipe = str(tmp_path / "replay.py")
-    recipes.load(recipe).train(tmp_path / "whole", seed=3, quiet=True)
-    run = stopped_run(recipes.load(recipe), tmp_path / "run", 13)
-    assert [run.stage(n).status for n in ("left", "balance", "selector")] == [
-        "done", "done", "training",
-    ]  # fmt: skip
-    recipes.load(recipe).resume(run.path, quiet=True)
-    assert policies(run.path) == policies(tmp_path / "whole")
-    headers = [header["__metadata__"]["skillweave"] for header, _ in policies(run.path).values()]
-    assert [json.loads(h)["algorithm"]["algorithm"] for h in headers] == ["DQN", "DQN", "SAC"]
 
 
 # Whoever learns, in this thread and in processes
@@ -499,8 +335,8 @@ class Killer(StopAt):
 
     killed = 0
 
-    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        super().tick(name, steps, seconds, metrics)
+    def tick(self, *told: Any) -> None:
+        super().tick(*told)
         workers = [p for p in multiprocessing.active_children() if p.name.startswith("collector")]
         if self.left % 3 == 0 and workers:
             workers[self.left % len(workers)].kill()
@@ -511,8 +347,8 @@ class Killer(StopAt):
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_a_run_of_any_learner_stopped_again_and_again_ends_as_if_it_had_not_been(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, learner: str, workers: int
-) -> None:
+    tmp_path, monkeypatch, learner, workers
+):
     gone_on = restored_stages(monkeypatch)
     monkeypatch.setattr(ReplayLearner, "report_every", 50)
     recipe = recipe_of(tmp_path, learner, workers)
@@ -548,51 +384,25 @@ def wait_for_lines(process: subprocess.Popen[str], run: Path, count: int) -> Non
         time.sleep(0.001)
 
 
-@pytest.fixture(scope="module")
-def interrupted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """A training process that was sent SIGINT (Ctrl-C) in its first stage."""
-    folder = tmp_path_factory.mktemp("interrupted")
-    recipe = write_recipe(folder)
-    command = [sys.executable, "-m", "skillweave", "train", str(recipe), "-o", str(folder / "run")]
-    command += ["--seed", "3", "--set", "skills.left.steps=3000", "--evaluate", "0"]
+@pytest.mark.slow
+def test_a_run_stopped_by_ctrl_c_says_how_to_go_on_and_ends_as_if_it_had_not_been(tmp_path, capsys):
+    recipe, run, whole = str(write_recipe(tmp_path)), tmp_path / "run", tmp_path / "whole"
+    train = ["train", recipe, "--seed", "3", "--set", "skills.left.steps=3000", "--evaluate", "0"]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        wait_for_lines(process, folder / "run", 20)
+        [sys.executable, "-m", "skillweave", *train, "-o", str(run)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        wait_for_lines(process, run, 20)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate()
-    done = {"code": process.returncode, "out": out, "err": err}
-    return done | {"recipe": recipe, "run": folder / "run"}
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_with_code_130_and_says_how_to_go_on(interrupted: dict[str, Any]) -> None:
-    assert interrupted["code"] == 130
-    assert "Traceback" not in interrupted["err"]
-    assert "stopped: saved at" in interrupted["err"]
-    assert f"skillweave resume {interrupted['run']}" in interrupted["err"]
-    assert interrupted["out"] == ""
-
-
-@pytest.mark.slow
-def test_the_command_that_ctrl_c_names_is_complete(interrupted: dict[str, Any]) -> None:
-    # A recipe in a user's file must be pointed to (contract 14), so the command must say so.
-    assert f"--recipe {interrupted['recipe']}" in interrupted["err"]
-
-
-@pytest.mark.slow
-def test_a_run_stopped_by_ctrl_c_ends_as_if_it_had_not_been(
-    tmp_path: Path, interrupted: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    recipe, run = str(interrupted["recipe"]), tmp_path / "run"
-    shutil.copytree(interrupted["run"], run)
+    assert (process.returncode, out) == (130, "")
+    assert "Traceback" not in err
+    assert "stopped: saved at" in err
+    assert f"skillweave resume {run} --recipe {recipe}" in err
     assert not RunDirectory.open(run).finished
-    common = ["--quiet", "--evaluate", "0"]
-    assert main(["resume", str(run), "--recipe", recipe, *common]) == 0
-    whole = str(tmp_path / "whole")
-    more = ["--set", "skills.left.steps=3000", "--seed", "3"]
-    assert main(["train", recipe, "-o", whole, *more, *common]) == 0
-    assert_same(run, tmp_path / "whole")
+    assert main(["resume", str(run), "--recipe", recipe, "--quiet", "--evaluate", "0"]) == 0
+    assert main([*train, "-o", str(whole), "--quiet"]) == 0
+    assert_same(run, whole)
 
 
 FULL = """
@@ -608,9 +418,7 @@ cp -r "$1/run" "$4/finished"
 
 
 @pytest.mark.slow
-def test_a_run_stopped_by_a_full_disk_goes_on_when_there_is_room_again(
-    tmp_path: Path, reference: Reference
-) -> None:
+def test_a_run_stopped_by_a_full_disk_goes_on_when_there_is_room_again(tmp_path, reference):
     if shutil.which("unshare") is None:
         pytest.skip("no small file system can be mounted here")
     recipe, whole = reference("sync")

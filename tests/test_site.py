@@ -41,7 +41,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_no_page_fetches_anything_from_elsewhere(site: Path) -> None:
+def test_no_page_fetches_anything_from_elsewhere(site):
     files = [*site.rglob("*.html"), *site.rglob("*.css"), *site.rglob("*.svg")]
     assert len(files) > 30
     found = {
@@ -52,21 +52,21 @@ def test_no_page_fetches_anything_from_elsewhere(site: Path) -> None:
     assert found == {}
 
 
-def test_every_public_name_has_its_place_in_the_reference(site: Path) -> None:
+def test_every_public_name_has_its_place_in_the_reference(site):
     text = "".join(page.read_text() for page in (site / "reference").glob("*.html"))
     places = [f"{module}.{name}" for module, homes in HOMES.items() for name in homes]
     missing = [place for place in places if f'id="{place}"' not in text]
     assert missing == []
 
 
-def test_fields_and_pictures_are_in_the_pages(site: Path) -> None:
+def test_fields_and_pictures_are_in_the_pages(site):
     skill = (site / "reference/skill.html").read_text()
     assert "always the true successor" in skill  # a comment beside a field of ``Step``
     concepts = (site / "concepts.html").read_text()
     assert concepts.count("<svg class=") >= 3  # drawn in the page, with its colours
 
 
-def test_search_finds_pages_that_are_opened_from_the_disk(site: Path) -> None:
+def test_search_finds_pages_that_are_opened_from_the_disk(site):
     playwright = pytest.importorskip("playwright.sync_api")
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
@@ -83,7 +83,7 @@ def test_search_finds_pages_that_are_opened_from_the_disk(site: Path) -> None:
         window.close()
 
 
-def test_the_reference_shows_plain_types_not_the_names_of_their_checks(site: Path) -> None:
+def test_the_reference_shows_plain_types_not_the_names_of_their_checks(site):
     text = (site / "reference" / "ppo.html").read_text()
     assert "gae_lambda" in text
     found = re.findall(r"\b(?:Fraction|AtLeastOne|NonNegative|Annotated|LearningRate)\b", text)

@@ -21,28 +21,11 @@ from gymnasium.spaces import (
     Tuple,
 )
 from gymnasium.vector import AutoresetMode, VectorEnv
+from toys import REALS, World
 
 import skillweave as sw
 
 SMALL = sw.PPO(num_envs=2, n_steps=8)
-REALS = Box(np.float32([-1, -3]), np.float32([1, 5]))
-
-
-class World(gym.Env):
-    """Has any spaces, and sees that each action is in its own."""
-
-    def __init__(self, observation_space=REALS, action_space=Discrete(2)):  # noqa: B008
-        self.observation_space, self.action_space = observation_space, action_space
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action), action
-        self.t += 1
-        return self.observation_space.sample(), 1.0, False, self.t == 5, {}
 
 
 def refused(tmp_path, env):
@@ -54,7 +37,7 @@ def refused(tmp_path, env):
 
 
 def followed(tmp_path, env, message, function=None):
-    """Train by the wrapper that a message shows."""
+    """Train by the wrapper that a message shows; return the run."""
     assert "\n" not in message
     code = message[message.index("EnvSpec(") :].replace("Box(...)", "Box(0, 1, (2,), 'float32')")
     names = {
@@ -62,8 +45,7 @@ def followed(tmp_path, env, message, function=None):
         "function": function,
     }  # fmt: skip
     spec = dataclasses.replace(eval(code, names), workers=1)
-    run = sw.train_agent(spec, SMALL, 48, tmp_path / "run", quiet=True)
-    assert run.evaluate(2, quiet=True).mean == 5
+    return sw.train_agent(spec, SMALL, 48, tmp_path / "run", quiet=True)
 
 
 SUPPORTED = {
@@ -149,7 +131,8 @@ def test_a_wrapper_for_observations_is_shown_and_works(tmp_path, space, way):
 
     message = refused(tmp_path, env)
     assert re.search(way, message), message
-    followed(tmp_path, env, message, lambda obs: np.zeros(2, np.float32))
+    run = followed(tmp_path, env, message, lambda obs: np.zeros(2, np.float32))
+    assert run.evaluate(2, quiet=True).mean == 5
 
 
 class Mission(gym.Space):
@@ -173,16 +156,13 @@ def test_a_space_of_the_users_own_is_left_out(tmp_path):
 
     message = refused(tmp_path, env)
     assert "the part mission of the observation space" in message
-    followed(tmp_path, env, message)
+    assert followed(tmp_path, env, message).evaluate(2, quiet=True).mean == 5
 
 
 def test_minigrid_trains_as_proposed(tmp_path):
     pytest.importorskip("minigrid")
     name = "MiniGrid-Empty-5x5-v0"
-    message = refused(tmp_path, name)
-    code = message[message.index("EnvSpec(") :]
-    spec = eval(code, {"EnvSpec": sw.EnvSpec, "env": name, "gymnasium": gymnasium})
-    sw.train_agent(dataclasses.replace(spec, workers=1), SMALL, 16, tmp_path / "run", quiet=True)
+    followed(tmp_path, name, refused(tmp_path, name))
 
 
 # Simulators that step many environments at once

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
-from gymnasium.vector.utils import batch_space, create_empty_array, iterate
+from gymnasium.vector.utils import batch_space, iterate
 from hypothesis import given, strategies as st
 
 from skillweave.errors import EnvError
@@ -35,16 +35,10 @@ def pixels(*shape, dtype=BYTES, high=255):
 @pytest.mark.parametrize(
     ("space", "image"),
     [
-        (pixels(84, 84, 3), (3, 84, 84)),
-        (pixels(3, 84, 84), (3, 84, 84)),
         (pixels(7, 8, 7), (7, 8, 7)),  # a tie: first
-        (pixels(84, 84, 1), (1, 84, 84)),
-        (pixels(4, 84, 84, 3), (12, 84, 84)),  # a stack of frames
-        (pixels(4, 3, 84, 84), (12, 84, 84)),
+        (pixels(4, 3, 84, 84), (12, 84, 84)),  # a stack of frames
         (pixels(16, 20), (1, 16, 20)),
         (pixels(5, 6, 3, dtype=bool, high=1), (3, 5, 6)),
-        (pixels(5, 6, 3, dtype=np.int64, high=9), (3, 5, 6)),
-        (pixels(5, 6, 3, dtype=np.float32, high=1), (3, 5, 6)),
     ],
     ids=str,
 )
@@ -69,14 +63,6 @@ def test_images_are_found_with_their_channels(space, image):
 def test_any_other_box_is_a_vector(space):
     codec = obs_codec(space)
     assert (codec.images, codec.size) == ((), int(np.prod(space.shape)))
-
-
-def test_channels_come_first_and_pixels_keep_their_place_and_type():
-    x = np.arange(2 * 5 * 6 * 3, dtype=BYTES).reshape(2, 5, 6, 3)
-    vector, (image,) = obs_codec(pixels(5, 6, 3)).split(to_tensor(x))
-    assert (vector.shape, vector.dtype) == ((2, 0), torch.float32)
-    assert image.dtype == torch.uint8
-    assert np.array_equal(image.numpy(), x.transpose(0, 3, 1, 2))
 
 
 def test_the_frames_of_a_stack_follow_each_other():
@@ -244,12 +230,6 @@ def test_packing_loses_nothing(space, n, seed):
     assert np.array_equal(pack(space, back), obs)
     for row, one in zip(iterate(batched, sample), obs, strict=True):
         assert np.array_equal(pack(space, row), one)
-
-
-@given(spaces)
-def test_a_packed_array_has_the_parts_of_gymnasiums(space):
-    empty = create_empty_array(space, 2)
-    assert pack(space, empty).shape[0] == 2
 
 
 @given(spaces)

@@ -16,12 +16,12 @@ from small_runs import (
     ON,
     SMALL,
     Balance,
-    Heard,
     Left,
     Push,
     Whole,
     assert_same,
     lines,
+    messages,
     new_run,
     policies,
     reports_every,
@@ -60,6 +60,18 @@ def declare(*skills, **how):
 
 
 CALLED = {"left": SkillReport(3, 3, {}, None, None), "push": SkillReport(9, 1, {}, None, None)}
+
+
+def played_as(monkeypatch, returns_of):
+    """Let evaluations have the returns that a function says of the skills of a policy."""
+
+    def played(policy, spec, *, engine, **how):
+        assert engine == spec.engine, "they are played where it was trained"
+        returns = returns_of(policy.skills)
+        mean = float(np.mean(returns))
+        return SimpleNamespace(mean=mean, returns=returns, lengths=(7, 8), skills=CALLED)
+
+    monkeypatch.setattr(select_best, "evaluate", played)
 
 
 def alternately(obs):
@@ -237,45 +249,21 @@ def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
     assert run.evaluate(100, seed=select_best.SEEDS + 3).mean == kept[best]
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("usual_episodes")
-def test_it_is_found_out_in_the_pool_where_it_was_trained_in_one(tmp_path):
-    pytest.importorskip("envpool")
-    hierarchy = declare(env=EnvSpec("CartPole-v1", workers=1), greedy_selector=True)
-    run = hierarchy.train(tmp_path / "run", seed=3, quiet=True)
-    kept = run.info()["stages"][-1]["kept"]
-    how = {"seed": select_best.SEEDS + 3, "deterministic": True}
-    assert run.evaluate(100, **how, engine="auto").mean == kept[kept["kept"]]
-    assert run.evaluate(100, **how).mean != kept[kept["kept"]]
-
-
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("engine", ["auto", "sync"])
-@pytest.mark.parametrize("better", [True, False])
+@pytest.mark.parametrize(("better", "engine"), [(True, "auto"), (False, "sync")])
 def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
     tmp_path, monkeypatch, better, engine
 ):
     """Not by chance: one of them always plays well here."""
-
-    wanted = engine
-
-    def played(policy, spec, *, engine, **how):
-        assert engine == spec.engine == wanted, "they are played where it was trained"
-        mean = 10.0 if policy.skills.greedy is better else 5.0
-        return SimpleNamespace(mean=mean, returns=(mean,) * 2, lengths=(7, 8), skills=CALLED)
-
-    monkeypatch.setattr(select_best, "evaluate", played)
-    heard = Heard()
+    played_as(monkeypatch, lambda skills: (10.0 if skills.greedy is better else 5.0,) * 2)
     hierarchy = declare(env=EnvSpec("CartPole-v1", engine=engine), greedy_selector=True)
-    run = new_run(hierarchy, tmp_path / "run")
-    with closing(run):
-        policy = training.train(hierarchy, run, (heard,))
-    assert policy.skills.greedy is better
-    assert run.stage("together").evaluation_steps == 30
+    said = messages(hierarchy, tmp_path / "run")
+    assert hierarchy.load(tmp_path / "run").policy.skills.greedy is better
+    assert RunDirectory.open(tmp_path / "run").stage("together").evaluation_steps == 30
     returns = (10.0, 5.0) if better else (5.0, 10.0)
     words = "greedy {:.4g}, with skills that sample {:.4g} (4 episodes each); kept: "
-    compared = next(i for i, text in enumerate(heard.said) if "playing 4 episodes of each" in text)
-    assert words.format(*returns) in heard.said[compared + 1]
+    compared = next(i for i, text in enumerate(said) if "playing 4 episodes of each" in text)
+    assert words.format(*returns) in said[compared + 1]
 
 
 @pytest.mark.fast_cases(1)
@@ -292,13 +280,12 @@ def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
 def test_a_selector_samples_where_that_is_clearly_better(tmp_path, monkeypatch, means, kept):
     """A greedy selector can call one skill forever, where a sampling one solves the task."""
 
-    def played(policy, spec, **how):
-        kind = (not policy.skills.greedy, not policy.skills.greedy_selector)
+    def returns_of(skills):
+        kind = (not skills.greedy, not skills.greedy_selector)
         mean = means.get(next(name for name, flags in SAMPLING.items() if flags == kind), 0.0)
-        returns = (mean - 1.0, mean + 1.0) * 20
-        return SimpleNamespace(mean=mean, returns=returns, lengths=(7,), skills=CALLED)
+        return (mean - 1.0, mean + 1.0) * 20
 
-    monkeypatch.setattr(select_best, "evaluate", played)
+    played_as(monkeypatch, returns_of)
     run = declare().train(tmp_path / "run", quiet=True)
     entry = RunDirectory.open(run.path).stage("together")
     assert entry.kept.kept == kept
@@ -324,20 +311,13 @@ def test_a_selector_that_was_better_with_exploration_is_named(
 ):
     """Returns of 0 and 1, of which a fifth are 1 without exploration: an error of 0.04."""
 
-    def played(policy, spec, **how):
-        return SimpleNamespace(mean=0.2, returns=(0, 0, 0, 0, 1) * 20, lengths=(7,), skills=CALLED)
-
     known = {} if exploring is None else {"return": exploring, "return_error": error}
     monkeypatch.setattr(Episodes, "summary", lambda self: {"length": 7.0} | known)
-    monkeypatch.setattr(select_best, "evaluate", played)
-    heard, hierarchy = Heard(), declare() if learns else declare(selector=alternately)
-    run = new_run(hierarchy, tmp_path / "run")
-    with closing(run):
-        training.train(hierarchy, run, (heard,))
-    said = [text for text in heard.said if "chosen at random" in text]
-    assert [("'left' in 75% of its decisions, for 1.0 steps" in text) for text in said] == [
-        True
-    ] * is_said
+    played_as(monkeypatch, lambda skills: (0, 0, 0, 0, 1) * 20)
+    hierarchy = declare() if learns else declare(selector=alternately)
+    heard = messages(hierarchy, tmp_path / "run")
+    said = ["'left' in 75% of its" in text for text in heard if "chosen at random" in text]
+    assert said == [True] * is_said
 
 
 @pytest.mark.parametrize(
@@ -374,24 +354,6 @@ def test_a_sampling_selector_samples_also_where_greedy_actions_are_asked(tmp_pat
     rng = np.random.default_rng(0)
     _, memory = policy.act(policy.start(200), obs, deterministic=True, rng=rng)
     assert len(set(memory["skill"].tolist())) > 1, "the selector is nearly uniform so early"
-
-
-@pytest.mark.slow
-def test_a_run_stopped_before_it_is_judged_is_not_finished(tmp_path, monkeypatch):
-    whole = declare().train(tmp_path / "whole", seed=3, quiet=True)
-
-    def stopped(*told, **how):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr(select_best, "evaluate", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            declare().train(tmp_path / "run", seed=3, quiet=True)
-    with pytest.raises(SkillweaveError, match=r"was not judged yet.*resume"):
-        declare().load(tmp_path / "run")
-    declare().resume(tmp_path / "run", quiet=True)
-    runs = [RunDirectory.open(path) for path in (tmp_path / "run", whole.path)]
-    assert runs[0].stage("together").kept == runs[1].stage("together").kept
 
 
 @pytest.mark.parametrize(("learn", "said"), [("apart", True), ("together", None)])
@@ -461,11 +423,7 @@ class Always(Left):
 
 def test_a_skill_that_never_succeeded_is_told_and_moves_freely_afterwards(tmp_path):
     hierarchy = declare(Never(), Always(), learn="apart, then together")
-    heard = Heard()
-    run = new_run(hierarchy, tmp_path / "run")
-    training.train(hierarchy, run, (heard,))
-    run.close()
-    said = [text for text in heard.said if "succe" in text]
+    said = [text for text in messages(hierarchy, tmp_path / "run") if "succe" in text]
     assert [text.partition(":")[0] for text in said[:2]] == ["never", "together"]
     assert all("'never' ended with success() true" in text for text in said[2:])
     assert "no call ended with success() true" in said[0]
@@ -473,6 +431,14 @@ def test_a_skill_that_never_succeeded_is_told_and_moves_freely_afterwards(tmp_pa
     told = lines(tmp_path / "run")[-1]
     assert "always.reference_kl" in told
     assert "never.reference_kl" not in told
+
+
+@pytest.fixture
+def skill_log(tmp_path):
+    """A new run, and the log of its first skill."""
+    run = new_run(declare(Left(), Balance(), learn="apart"), tmp_path / "run")
+    with closing(run):
+        yield run, StageLog("left", run, (), Checkpoint.start("left"))
 
 
 @pytest.mark.parametrize(
@@ -486,22 +452,19 @@ def test_a_skill_that_never_succeeded_is_told_and_moves_freely_afterwards(tmp_pa
     ],
 )
 def test_success_is_judged_by_all_calls_of_a_stage_and_its_rate_by_the_last(
-    tmp_path, told, succeeded, rate
+    skill_log, told, succeeded, rate
 ):
-    run = new_run(declare(Left(), Balance(), learn="apart"), tmp_path / "run")
-    log = StageLog("left", run, (), Checkpoint.start("left"))
+    run, log = skill_log
     for update, metrics in enumerate(told):
         log.tick(update, 64 * (update + 1), 0.1, metrics)
     log.done({}, {})
-    run.close()
     entry = RunDirectory.open(run.path).stage("left")
     assert entry.succeeded is succeeded
     assert success_rate(entry) == rate
 
 
-def test_lines_that_name_no_stage_say_nothing_of_success_and_words_are_refused(tmp_path):
-    run = new_run(declare(Left(), Balance(), learn="apart"), tmp_path / "run")
-    log = StageLog("left", run, (), Checkpoint.start("left"))
+def test_lines_that_name_no_stage_say_nothing_of_success_and_words_are_refused(skill_log):
+    run, log = skill_log
     log.tick(0, 64, 0.1, {"success": 0.0})
     for other in (1.0, True, None):
         run.log({"success": other})
@@ -510,7 +473,6 @@ def test_lines_that_name_no_stage_say_nothing_of_success_and_words_are_refused(t
     run.log({"stage": "left", "success": "often"})
     with pytest.raises(SkillweaveError, match=r"metrics\.jsonl: 'left' has .* 'often', .* resume"):
         log.done({}, {})
-    run.close()
 
 
 class Right(Skill):

@@ -107,22 +107,15 @@ def used(folder: Path, name: str) -> tuple[Any, ...]:
     return policies(folder), returns, sampled, np.asarray(run.act(obs)).tolist()
 
 
-@pytest.mark.slow
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_every_algorithm_learns_the_same(name, tmp_path):
+def test_every_algorithm_learns_the_same_and_leaves_the_mode(name, tmp_path):
     usual = used(tmp_path / "usual", name)
     for mode, entered in MODES.items():
         with entered():
+            before = now()
             assert used(tmp_path / mode, name) == usual, mode
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_plain_training_is_the_same_and_leaves_the_mode(mode, tmp_path):
-    usual = used(tmp_path / "usual", "PPO")
-    with MODES[mode]():
-        before = now()
-        assert used(tmp_path / "here", "PPO") == usual
-        assert now() == before
+            assert now() == before, mode
 
 
 def tree(**more: Any) -> Hierarchy:

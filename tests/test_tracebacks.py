@@ -14,6 +14,7 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
+from toys import World
 
 from skillweave import PPO, EnvSpec, Hierarchy, Skill, evaluate
 from skillweave._internal.messages import error_text
@@ -139,13 +140,7 @@ class Plain(Skill):
     pass
 
 
-class Broken(gym.Env[Any, Any]):
-    observation_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return np.zeros(2, np.float32), {}
-
+class Broken(World):
     def step(self, action: Any) -> Any:
         return {}["no such key"]  # step fails
 

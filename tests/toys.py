@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import importlib.util
 import pickle
 import sys
@@ -100,6 +101,36 @@ class Rememberer(gym.Env):
         change = float(np.abs(action - self.previous).sum())
         self.previous = action
         return np.zeros(1, np.float32), change, False, False, {}
+
+
+REALS = gym.spaces.Box(np.float32([-1, -3]), np.float32([1, 5]))
+
+
+class World(gym.Env):
+    """Has any spaces, and sees that each action is in its own; episodes of 5 steps that pay 1."""
+
+    def __init__(
+        self,
+        observation_space: gym.Space[Any] = REALS,
+        action_space: gym.Space[Any] = gym.spaces.Discrete(2),  # noqa: B008
+    ) -> None:
+        self.observation_space = copy.deepcopy(observation_space)  # which has a generator
+        self.action_space = action_space
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        if seed is not None:
+            self.observation_space.seed(seed)
+        self.t = 0
+        return self.see(), {}
+
+    def see(self) -> Any:
+        return self.observation_space.sample()
+
+    def step(self, action: Any) -> Any:
+        assert self.action_space.contains(action), action
+        self.t += 1
+        return self.see(), 1.0, False, self.t == 5, {}
 
 
 def skills_of(*skills: Any, **how: Any) -> SkillSet:
@@ -475,16 +506,21 @@ class _Renumbered:
         return self.node / self.member
 
 
-def own_algorithm() -> Any:
-    """The example of an algorithm of one's own as a module; made once, it registers A2C."""
-    if "own_algorithm" not in sys.modules:
-        path = Path(__file__).parents[1] / "examples/own_algorithm.py"
-        spec = importlib.util.spec_from_file_location("own_algorithm", path)
+def example(name: str) -> Any:
+    """A program of ``examples/`` as a module, made once."""
+    if name not in sys.modules:
+        path = Path(__file__).parents[1] / f"examples/{name}.py"
+        spec = importlib.util.spec_from_file_location(name, path)
         assert spec is not None
         assert spec.loader is not None
-        sys.modules["own_algorithm"] = module = importlib.util.module_from_spec(spec)
+        sys.modules[name] = module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
-    return sys.modules["own_algorithm"]
+    return sys.modules[name]
+
+
+def own_algorithm() -> Any:
+    """The example of an algorithm of one's own; it registers A2C."""
+    return example("own_algorithm")
 
 
 @dataclass

@@ -11,21 +11,13 @@ from skillweave.runs.files import write_json, write_tensors
 
 def make_run(path, seconds):
     """What a finished run looks like."""
-    lines = [
-        {"stage": "flat", "update": i, "return": 2.0 * i, "seconds": i * seconds} for i in (1, 2)
-    ]
     path.mkdir()
+    lines = [{"stage": "flat", "update": i, "return": 2.0 * i, "seconds": seconds} for i in (1, 2)]
     (path / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in lines))
-    final = {
-        "name": "flat",
-        "seconds": seconds,
-        "metrics_bytes": int(seconds),
-        "final": {"return": 4},
-    }
-    write_json(path / "run.json", {"seed": 3, "created": str(seconds), "stages": [final]})
-    write_tensors(
-        path / "policies" / "flat.safetensors", {"w": torch.arange(3.0)}, {"kind": "agent"}
-    )
+    stage = {"name": "flat", "seconds": seconds, "metrics_bytes": int(seconds)}
+    write_json(path / "run.json", {"seed": 3, "created": str(seconds), "stages": [stage]})
+    policy = path / "policies" / "flat.safetensors"
+    write_tensors(policy, {"w": torch.arange(3.0)}, {"kind": "agent"})
     return path
 
 

