@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from goals.worlds import Point
 from planning.logs import log_of
-from planning.steps import assert_not_repeated, at, step_to
+from planning.steps import assert_not_repeated, at, step_to, watched
 from ready_selectors.chain import (
     DOOR,
     KEY,
@@ -296,7 +296,7 @@ def test_goals_that_observations_hold() -> None:
     choice, memory = bound.act(bound.start(3), obs)
     assert choice.tolist() == [0, 1, 0]
     last = LastCall(choice, np.full(3, CallEnd.RUNNING, np.int8), np.zeros(3, bool))
-    memory = bound.watch(memory, step_to([[4, 0], [6, 10], [3, 3]], obs), last)
+    memory = watched(bound, memory, step_to([[4, 0], [6, 10], [3, 3]], obs), last)
     assert memory["state"].tolist() == [0, 0, 1]
 
 
@@ -377,8 +377,8 @@ def test_it_chooses_lengths_when_they_are_chosen() -> None:
     bound = planner.among(("go", "back"))
     choice, memory = bound.act(memory, np.float32([[4, 0, 0]]))
     assert choice[0] // 3 == 1
-    memory = bound.watch(
-        memory, step_to([[0, 1, 0]]), LastCall(choice // 3, np.int8([1]), np.zeros(1, bool))
+    memory = watched(
+        bound, memory, step_to([[0, 1, 0]]), LastCall(choice // 3, np.int8([1]), np.zeros(1, bool))
     )
     assert memory["state"].tolist() == [1]
     choice, _ = bound.act(memory, np.float32([[0, 1, 0]]))
