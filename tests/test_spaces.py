@@ -299,19 +299,32 @@ def test_a_space_survives_json(space):
     assert back == space
 
 
+def number(value):
+    return {"array": value, "dtype": "int64"}
+
+
+def discrete(**changes):
+    """A changed entry of Discrete(3)."""
+    bounds = {"low": number(0), "high": number(2)}
+    return {"type": "Space", "kind": "Discrete", "dtype": "int64"} | bounds | changes
+
+
 @pytest.mark.parametrize(
     "data",
     [
         {},
         {"type": "Text"},
-        {"type": "Discrete"},
-        {"type": "Discrete", "n": 0, "start": 0},
-        {"type": "Box", "shape": [2], "dtype": "float32", "low": [0], "high": [1, 2, 3]},
-        {"type": "Box", "shape": [1], "dtype": "wide", "low": [0], "high": [1]},
-        {"type": "MultiDiscrete", "nvec": [0], "start": [0]},
-        {"type": "Box", "shape": [1], "dtype": "uint8", "low": 0, "high": 300},
-        {"type": "Dict", "spaces": {"a": 1}},
-        {"type": "Dict", "spaces": [["a", {"type": "Text"}]]},
+        {"type": "Space", "kind": "Text"},
+        {"type": "Space", "kind": "Discrete"},
+        discrete(low=number(0), high=number(-1)),
+        discrete(shape=[2], low=number(0), high=number([1, 2])),
+        discrete(dtype="wide"),
+        discrete(low=number(0) | {"dtype": "uint8"}, high=number(300) | {"dtype": "uint8"}),
+        discrete(owners={"a": [0, 1]}),
+        {"type": "Space", "kind": "MultiBinary"} | {k: number(1) for k in ("low", "high")},
+        {"type": "Space", "kind": "Box", "dtype": "float32", "shape": [10**12]},
+        {"type": "Space", "kind": "Dict", "parts": {"a": 1}},
+        {"type": "Space", "kind": "Dict", "parts": [["a", {"type": "Text"}]]},
     ],
     ids=str,
 )

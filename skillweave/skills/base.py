@@ -334,7 +334,7 @@ class Reflex:
             )
         fitted(str | None, name, "a Reflex's name")
         self.condition, self.action = condition, action
-        self.name: str = name or getattr(condition, "__name__", "reflex")
+        self.name = str(name or getattr(condition, "__name__", "reflex"))
 
     def override(self, space: Data) -> Override:
         """Return the reflex for actions of a space, asked with this library's messages.

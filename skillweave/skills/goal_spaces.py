@@ -40,7 +40,11 @@ def other_goals(trained: gym.Space[Any], declared: gym.Space[Any]) -> str:
 
     Other bounds are other goals: they say which goals it practised.
     """
-    if trained == declared:
+    from skillweave.spaces.saving import gym_space  # needs torch, which declaring does not
+
+    # MultiBinary([4]) is MultiBinary(4) where it was read from a file.
+    one, other = (gym_space(space_of(space)) for space in (trained, declared))
+    if one == other:
         return ""
     return (
         f"was trained for goals of {short(trained, 300)}, but now its goal_space is "

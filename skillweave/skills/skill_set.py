@@ -122,7 +122,8 @@ def acting_policy(
         greedy_selector=skills.greedy_selector,
         ask=ask,
     )
-    policy = _overridden(policy, skills.reflexes, skills.action_space)
+    if skills.reflexes:
+        policy = _overridden(policy, skills.reflexes, skills.action_space)
     return _remembering(policy, skills) if outermost else policy
 
 
@@ -167,13 +168,12 @@ def acting_apart(
         reflexes: in force.
         space: of the environment's actions.
     """
-    return _overridden(_whole(policy, skill, part), reflexes, space)
+    whole = _whole(policy, skill, part)
+    return _overridden(whole, reflexes, space) if reflexes else whole
 
 
 def _overridden(policy: Policy, reflexes: tuple[Reflex, ...], space: gym.Space[Any]) -> Policy:
-    """Return a policy with reflexes, if there are some."""
-    if not reflexes:
-        return policy
+    """Return a policy with reflexes."""
     acts = space_of(space)
     return Reflexes(policy, tuple(reflex.override(acts) for reflex in reflexes), acts)
 
