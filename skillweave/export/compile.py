@@ -123,7 +123,7 @@ def _skill(skill: CalledSkill, prefix: str, knows: bool, *, sampled: bool) -> Ca
     goals = skill.goals
     if isinstance(goals, Goals):
         clip = goals.skill.clip_goal if goals.skill.defines("clip_goal") else None
-        goals = CallGoals(skill.path, goals.space, clip, skill.termination)
+        goals = CallGoals(skill.path, goals.space, clip)
     inside = _compiled(skill.policy, prefix + skill.name, sampled=sampled)
     success = skill.success if knows else None
     return replace(skill, policy=inside, goals=goals, success=success)

@@ -118,13 +118,6 @@ def draw_from(space: gym.Space[Any], n: int, rng: np.random.Generator) -> Array:
     return batch
 
 
-def leaf_at(space: Any, path: tuple[str, ...]) -> gym.Space[Any]:
-    """Return the part of a space to which these names lead."""
-    for name in path:
-        space = space[int(name) if isinstance(space, gym.spaces.Tuple) else name]
-    return space  # type: ignore[no-any-return]
-
-
 def alone(space: Data, goal: Any) -> Any:
     """Return one element of a space as a batch of one, parts in a dict; it is not checked.
 

@@ -10,9 +10,11 @@ import numpy as np
 from skillweave.errors import PolicyError, RunError
 from skillweave.policies.codec import Reader, Written
 from skillweave.policies.files import shown
+from skillweave.policies.hierarchy import SKILL
+from skillweave.policies.parts import GOAL
 from skillweave.policies.spaces import MOST, Space, space_of
 from skillweave.schema import fit
-from skillweave.spaces.choices import GOAL, SKILL, ChoiceSpace
+from skillweave.spaces.choices import ChoiceSpace
 from skillweave.spaces.observations import image_layout
 from skillweave.spaces.packing import obs_dtype, parts
 
