@@ -26,7 +26,7 @@ from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.own_part import OwnPart
-from skillweave.skills.skill_set import SkillSet, policy_of, selects
+from skillweave.skills.skill_set import SkillSet, policy_of
 from skillweave.types import Array, Memory, Policy, Step
 
 
@@ -115,7 +115,7 @@ class OwnSelector(ReadySelector):
     @cached_property
     def in_place(self) -> ViewedSelector:  # type: ignore[override]
         """The selector, which sees its own observations."""
-        return ViewedSelector(selects(self.selector, "the selector"), self._view.obs)
+        return ViewedSelector(self.selector.in_place, self._view.obs)
 
     def source(self) -> dict[str, Any]:
         """Return the fields of the selector's source."""

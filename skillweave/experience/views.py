@@ -17,9 +17,10 @@ from skillweave.algorithms.batches import OF_STEP, Batch, Trace
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.policies.core import OWN, RUNNING, own_step, part_of
 from skillweave.skills import Skill, asked
-from skillweave.skills.goals import Goals, check_reads_goal, is_unchecked
+from skillweave.skills.goals import Goals, check_reads_goal
 from skillweave.skills.outputs import missing_key
 from skillweave.skills.own_part import OwnPart
+from skillweave.skills.probing import first_time
 from skillweave.types import Array, Step
 
 AT_ONCE = 1 << 26
@@ -83,7 +84,12 @@ class OwnSteps:
             ``reward``, ``terminated`` and ``truncated``, 0 in other rows; ``valid`` is ``acts``.
         """
         acts, skill = self.acts, self.skill
-        if self.goal is not None and skill is not None and acts.any() and is_unchecked(skill):
+        if (
+            self.goal is not None
+            and skill is not None
+            and acts.any()
+            and first_time(skill, "its goal")
+        ):
             t = int(acts.any(axis=1).argmax())
             check_reads_goal(skill, self._alone(skill, t, np.flatnonzero(acts[t])))
         terminated = acts & (self.trace["env_terminated"] | (end == OWN))

@@ -23,9 +23,9 @@ from skillweave.policies.hierarchy import (
     Hierarchy,
     Interruption,
 )
-from skillweave.policies.leaves import Network, Ready, Selector
+from skillweave.policies.leaves import Network, Selector
 from skillweave.policies.mapped import Function, Mapped, Outputs
-from skillweave.policies.parts import Corrects, Override, PartOf, Reflexes, Viewed
+from skillweave.policies.parts import Corrects, PartOf, Viewed
 from skillweave.policies.planned import Planned
 from skillweave.policies.spaces import Space, space_of
 from skillweave.skills.goals import Goals
@@ -65,8 +65,6 @@ def _compiled(policy: Policy, name: str, *, sampled: bool) -> Policy:
             made = replace(policy, policy=_compiled(policy.policy, name, sampled=sampled))
             if isinstance(made, Corrects):
                 made.base = _compiled(made.base, f"{name}.base", sampled=False)
-            if isinstance(made, Reflexes):
-                made.reflexes = tuple(_rule(reflex, made.space) for reflex in made.reflexes)
             return made
         case Mapped():
             return as_file(policy, where, sampled=sampled)
@@ -85,7 +83,7 @@ def _leaf(policy: Returns, where: str, sampled: bool) -> Policy:
     inside = policy.policy
     if isinstance(inside, AgentPolicy):
         return agent_graph(inside, sampled, where)
-    if isinstance(policy, Ready) or inside.start(1):
+    if inside.start(1):
         kind = type(inside).__name__
         raise PolicyError(
             f"{where} is a {kind}, whose memory cannot be written as ONNX: train the skill, or "
@@ -125,7 +123,7 @@ def _skill(skill: CalledSkill, prefix: str, knows: bool, *, sampled: bool) -> Ca
     goals = skill.goals
     if isinstance(goals, Goals):
         clip = goals.skill.clip_goal if goals.skill.defines("clip_goal") else None
-        goals = CallGoals(skill.path, goals.space, clip, skill.termination)
+        goals = CallGoals(skill.path, goals.space, clip)
     inside = _compiled(skill.policy, prefix + skill.name, sampled=sampled)
     success = skill.success if knows else None
     return replace(skill, policy=inside, goals=goals, success=success)
@@ -141,10 +139,3 @@ def _interruption(how: Interruption | None, prefix: str) -> Interruption | None:
     values = int(how.critic.heads(sees.start(1)).shape[1])
     worth = Space("Box", "float32", (values,), np.array(-np.inf), np.array(np.inf))
     return Interruption(Critic(Network(file, sees, worth)), how.margin)
-
-
-def _rule(reflex: Any, space: Space) -> Override:
-    if isinstance(reflex, Override):  # of a policy that was read
-        return reflex
-    action = reflex.action if callable(reflex.action) else reflex.fixed(space)[None]
-    return Override(reflex.name, reflex.condition, action)

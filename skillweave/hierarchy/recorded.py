@@ -67,7 +67,7 @@ def level_entry(roles: Roles, level: Level) -> LevelEntry:
         search_steps=apart.search_steps,
         episode_calls=apart.episode_calls,
         call_cost=selection.call_cost,
-        reflexes=[str(reflex.name) for reflex in level.reflexes],
+        reflexes=[reflex.name for reflex in level.reflexes],
         selector=None if ready is None else source_of(ready),
         guide=guided,
     )

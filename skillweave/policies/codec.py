@@ -65,6 +65,8 @@ class Written:
     code: dict[str, str] = field(default_factory=dict)
     """By name, a description of each function that a reader needs."""
     functions: dict[str, Callable[..., Any]] = field(default_factory=dict)
+    small: int = SMALL
+    """The most numbers of an array in the tree."""
 
     def tree(self, value: Any, path: str = "", own: Field[Any] | None = None) -> Any:
         """Return a value as JSON.
@@ -114,7 +116,7 @@ class Written:
         return entry
 
     def _array(self, value: Array, path: str, own: Field[Any] | None) -> dict[str, Any]:
-        if value.size > SMALL or value.dtype.names is not None:
+        if value.size > self.small or value.dtype.names is not None:
             name = f"{path}.{own.name}" if own is not None else path
             return {"stored": _free(self.arrays, name, value)}
         return {"array": self.tree(value.tolist(), path), "dtype": str(value.dtype)}
@@ -177,6 +179,7 @@ class Reader:
     code: Mapping[str, Callable[..., Any]]
     files: Mapping[str, bytes]
     arrays: Mapping[str, Array]
+    small: int = SMALL
 
     def read(self, kind: Any, entry: Any, where: str) -> Any:
         """Return the value of an entry, which must be of a kind: any annotation of a field.
@@ -240,15 +243,19 @@ class Reader:
             numbers = self._numbers(kind, entry["array"], f"{where}.array")
             with np.errstate(over="raise"):
                 found = np.array(numbers, dtype)
+            if kind is int and found.tolist() != numbers:  # before NumPy 2 they become others
+                raise OverflowError(f"not all of its numbers are of {dtype}")
         except (KeyError, TypeError, ValueError, ArithmeticError) as error:
             raise PolicyError(f"{where} is no array: {str(error)[:200]}") from error
-        if dtype.kind not in "biuf" or found.size > SMALL:
-            raise PolicyError(f"{where} is no array of at most {SMALL} numbers")
+        if dtype.kind not in "biuf" or found.size > self.small:
+            raise PolicyError(f"{where} is no array of at most {self.small} numbers")
         return found
 
     def _numbers(self, kind: type[Any], entry: Any, where: str) -> Any:
         if isinstance(entry, list):
             return [self._numbers(kind, x, where) for x in entry]
+        if kind is int and type(entry) is int:  # the array's type bounds it
+            return entry
         return self.read(kind, entry, where)
 
     def _beside(self, table: Mapping[str, Any], name: str, where: str, what: str) -> Any:

@@ -66,9 +66,6 @@ class CallGoals:
     clip: Callable[..., Any] | None = code(
         "observations and goals (n, ...) to goals (n, ...)", "clip_goal", needed=False
     )
-    termination: Callable[..., Any] | None = code(
-        "a Step to (n,) bool", "termination", needed=False
-    )
 
     def start(self, n: int) -> Array:
         """Return goals of n environments without a call, (n, *goal_shape)."""
@@ -103,16 +100,16 @@ class CallGoals:
             raise SkillError(says + advice * (self.clip is None))
         return goals
 
-    def hold(self, obs: Array, goal: Array) -> Array:
+    def hold(self, obs: Array, goal: Array, termination: Callable[..., Any] | None) -> Array:
         """Return the goals (n, …) for which a call would end at once, (n,) bool.
 
-        For them ``termination`` is true for a step that stands still in ``obs`` (n, …). Where it
-        fails for such a step, as it reads ``info`` for example, no goal holds.
+        For them the skill's ``termination`` is true for a step that stands still in ``obs`` (n, …).
+        Where it fails for such a step, as it reads ``info`` for example, no goal holds.
         """
         zeros, ones = np.zeros(len(obs), np.float32), np.ones(len(obs), np.int64)
         no = zeros > 0
         still = Step(obs, zeros, obs, zeros, no, no, no, ones, {}, goal)
-        ends: Any = self.termination
+        ends: Any = termination
         with suppress(Exception), np.errstate(all="ignore"):
             return np.array(ends(still), bool).reshape(len(obs))
         return no
@@ -379,7 +376,7 @@ class Hierarchy(Choices, Policy):
         holds = np.zeros(len(choice), bool)
         for i, mine in self._with_goals(choice):
             goal = choice[GOAL][self.skills[i].name][mine]
-            holds[mine] = self.goals[i].hold(obs[mine], goal)
+            holds[mine] = self.goals[i].hold(obs[mine], goal, self.skills[i].termination)
         return holds
 
     def fitted(self, choice: Array, obs: Array, who: str) -> Array:

@@ -10,7 +10,6 @@ import numpy as np
 
 from .core import Array, LastCall, Memory, Policy, Step, Turn, World
 from .errors import PolicyError
-from .functional import Returns
 from .mapped import NUMBERS, open_session
 from .spaces import Space, at
 
@@ -56,38 +55,6 @@ class Selector(Policy):
     def redraws(self, greedy: bool) -> bool:
         """Return False: what it chooses follows from what it sees."""
         return False
-
-
-class Ready(Returns, Selector):
-    """A selector of the form of ``ReadySelector``.
-
-    Its policy has ``chances``, ``allowed``, ``watch``, ``ranges``, ``skills`` and ``lengths``, as
-    ``ReadySelector`` has them.
-    """
-
-    @property
-    def count(self) -> int:  # type: ignore[override]
-        """The number of its choices."""
-        return len(self.policy.skills) * max(1, len(self.policy.lengths))
-
-    def _chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
-        chances, after = self.policy.chances(self._of(memory, rows), obs, may)
-        self._keep(memory, rows, after)
-        found: Array = chances
-        return found
-
-    def allowed(self, memory: Memory, rows: Array) -> Array | None:
-        """Return the skills that it may choose next, see ``Selector``."""
-        allowed: Array | None = self.policy.allowed(self._of(memory, rows))
-        return allowed
-
-    def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
-        """Show it a step, and how the last calls ended."""
-        self._keep(memory, rows, self.policy.watch(self._of(memory, rows), step, last))
-
-    def values(self) -> dict[str, Any]:
-        """Return the ranges of indices in its memory."""
-        return dict(self.policy.ranges)
 
 
 class Learning(Policy):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import prod
 from typing import Any
@@ -414,8 +414,7 @@ class Override:
 class Reflexes(Around):
     """Rules that override the policy's action; the last one whose condition holds acts."""
 
-    reflexes: tuple[Any, ...] = field(metadata={"kind": tuple[Override, ...]})
-    """``Override``, or what else has ``apply``."""
+    reflexes: tuple[Override, ...]
     space: Space
     """Of the actions."""
 

@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -17,6 +18,7 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave._internal.notebooks import facts, joined
 from skillweave.errors import DeclarationError, SkillError
+from skillweave.policies.parts import Override
 from skillweave.policies.spaces import Space as Data
 from skillweave.schema import (
     AtLeastOne,
@@ -28,7 +30,7 @@ from skillweave.schema import (
 )
 from skillweave.skills.goal_spaces import alone, draw_from
 from skillweave.skills.learnable import Learnable
-from skillweave.skills.outputs import answer, as_array, called
+from skillweave.skills.outputs import Wrapped, answer, as_array, called
 from skillweave.skills.own_part import declared_acts, declared_sees
 from skillweave.skills.probing import probe
 from skillweave.skills.residual import Residual
@@ -332,32 +334,19 @@ class Reflex:
             )
         fitted(str | None, name, "a Reflex's name")
         self.condition, self.action = condition, action
-        self.name = name or getattr(condition, "__name__", "reflex")
+        self.name = str(name or getattr(condition, "__name__", "reflex"))
 
-    def check(self, space: Data) -> None:
-        """Raise a DeclarationError where a fixed action is not in ``space``."""
-        if not callable(self.action):
-            self.fixed(space)
-
-    def apply(self, obs: Array, action: Array, space: Data) -> tuple[Array, Array]:
-        """Return actions (N, ...) of ``space`` with this reflex; (N,) bool: where it acted.
-
-        ``obs`` (N, *obs_shape) is the observation, ``action`` (N, ...) what a skill does there.
+    def override(self, space: Data) -> Override:
+        """Return the reflex for actions of a space, asked with this library's messages.
 
         Raises:
-            SkillError: its condition or action has a wrong result; the message names it.
+            DeclarationError: its action is fixed, and is not in ``space``.
         """
-        holds = self.holds(obs)
-        if holds.any():
-            action = action.copy()
-            if callable(self.action):
-                seen, label = obs[holds], f"{self._label}: action()"
-                given = called(self.action, seen, label)
-                action[holds] = space.actions(given, len(seen), label, SkillError)
-                probe(self.action, seen, label, space)
-            else:
-                action[holds] = self.fixed(space)
-        return action, holds
+        action: Any = self.action
+        action = (
+            Wrapped(action, partial(self._act, space)) if callable(action) else self._fixed(space)
+        )
+        return Override(self.name, Wrapped(self.condition, self.holds), action)
 
     def holds(self, obs: Array) -> Array:
         """Evaluate its condition: ``obs`` (N, *obs_shape) to (N,) bool.
@@ -367,8 +356,15 @@ class Reflex:
         """
         return answer(self.condition, obs, bool, f"{self._label}: condition()")
 
-    def fixed(self, space: Data) -> Array:
-        """Return a fixed action as an element of ``space``, (...)."""
+    def _act(self, space: Data, obs: Array) -> Array:
+        """Return the actions (n, ...) of its function."""
+        label = f"{self._label}: action()"
+        actions = space.actions(called(self.action, obs, label), len(obs), label, SkillError)
+        probe(self.action, obs, label, space)
+        return actions
+
+    def _fixed(self, space: Data) -> Array:
+        """Return a fixed action, (1, ...)."""
         label = f"{self._label}: action"
         if space.parts is not None:
             batch = alone(space, self.action)
@@ -376,8 +372,7 @@ class Reflex:
             value = as_array(self.action, label, DeclarationError)
             # A number fills a row: Reflex(leaning, 0.5) in a Box of one dimension.
             batch = (np.full(space.shape, value) if value.shape == () else value)[None]
-        action: Array = space.actions(batch, 1, label, DeclarationError)[0]
-        return action
+        return space.actions(batch, 1, label, DeclarationError)
 
     @property
     def _label(self) -> str:

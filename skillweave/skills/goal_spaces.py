@@ -40,7 +40,11 @@ def other_goals(trained: gym.Space[Any], declared: gym.Space[Any]) -> str:
 
     Other bounds are other goals: they say which goals it practised.
     """
-    if trained == declared:
+    from skillweave.spaces.saving import gym_space  # needs torch, which declaring does not
+
+    # MultiBinary([4]) is MultiBinary(4) where it was read from a file.
+    one, other = (gym_space(space_of(space)) for space in (trained, declared))
+    if one == other:
         return ""
     return (
         f"was trained for goals of {short(trained, 300)}, but now its goal_space is "
@@ -112,13 +116,6 @@ def draw_from(space: gym.Space[Any], n: int, rng: np.random.Generator) -> Array:
             drawn = np.where(both, uniform, drawn)
         at(batch, path)[...] = drawn.astype(leaf.dtype).clip(low, high)
     return batch
-
-
-def leaf_at(space: Any, path: tuple[str, ...]) -> gym.Space[Any]:
-    """Return the part of a space to which these names lead."""
-    for name in path:
-        space = space[int(name) if isinstance(space, gym.spaces.Tuple) else name]
-    return space  # type: ignore[no-any-return]
 
 
 def alone(space: Data, goal: Any) -> Any:

@@ -8,7 +8,6 @@ A skill with a goal is one policy for many tasks: its networks see the observati
 from __future__ import annotations
 
 from dataclasses import fields
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from skillweave.policies.spaces import space_of
 from skillweave.skills.base import Skill, path_of
 from skillweave.skills.goal_spaces import alone
 from skillweave.skills.outputs import called
-from skillweave.skills.probing import first_time, untouched
+from skillweave.skills.probing import untouched
 from skillweave.types import Array, Step, read_only
 
 
@@ -56,8 +55,7 @@ class Goals(CallGoals):
             text = f"goal_{text}" if text.startswith("space ") else text
             raise DeclarationError(f"{self._who}: {text}") from error
         clip = self._clip if skill.defines("clip_goal") else None
-        holds = partial(called, skill.termination, who=self._label, judges=None)
-        super().__init__(path_of(skill), space_of(space), clip, holds)
+        super().__init__(path_of(skill), space_of(space), clip)
         if not self.space.size:
             raise DeclarationError(
                 f"{self._who}: goal_space is {short(space)}, which holds no number: leave it out"
@@ -88,7 +86,7 @@ class Goals(CallGoals):
         for _ in range(TRIES):
             given = called(self.skill.goals, read_only(obs), self._label, more=(rng,))
             goal[rows] = self.fitted(obs, given, self._label)
-            again = self.hold(obs, goal[rows])
+            again = self.hold(obs, goal[rows], self.skill.termination)
             if not again.any():
                 break
             obs, rows = obs[again], rows[again]
@@ -128,11 +126,6 @@ class _Watched(Step):
     @goal.setter
     def goal(self, value: Any) -> None:
         self._goal = value
-
-
-def is_unchecked(skill: Skill) -> bool:
-    """Return True once for each skill."""
-    return first_time(skill, "its goal")
 
 
 def check_reads_goal(skill: Skill, step: Step) -> None:

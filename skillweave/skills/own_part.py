@@ -26,7 +26,6 @@ from skillweave.policies.parts import Correction, Part
 from skillweave.policies.spaces import Space as Data, space_of
 from skillweave.schema import as_json
 from skillweave.skills.foreign_policy import source_of
-from skillweave.skills.goal_spaces import leaf_at
 from skillweave.skills.mapping import (
     Acts,
     PolicyMapping,
@@ -350,9 +349,10 @@ class OwnPart:
     def _input_space(self, given: Input) -> Space[Any]:
         """Return the space of one input."""
         from skillweave.spaces.observations import image_layout
+        from skillweave.spaces.packing import leaf_spaces
 
-        whole, take = self.whole_observation_space, given.takes[0]
-        read = [leaf_at(whole, x.fields) for x in given.takes if x.source == "observation"]
+        leaves, take = leaf_spaces(self.whole_observation_space), given.takes[0]
+        read = [leaves[x.fields] for x in given.takes if x.source == "observation"]
         if len(given.takes) > 1 and any(image_layout(leaf) is not None for leaf in read):
             raise DeclarationError(
                 f"{self.who}: sees joins an image with other parts of the observation: give each "

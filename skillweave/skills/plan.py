@@ -23,7 +23,6 @@ from skillweave.policies.mapped import (
 )
 from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import made_up
-from skillweave.skills.goal_spaces import leaf_at
 from skillweave.skills.mapping import Acts, Goal, LastAction, Part, PolicyMapping, Source
 from skillweave.skills.outputs import of_numbers
 from skillweave.types import Array
@@ -121,6 +120,7 @@ class _Reader:
     def _reads(self, part: Part, alone: bool, where: str) -> list[Take]:
         """Return what is taken of each leaf that a part reads, in the part's order."""
         from skillweave.spaces.observations import image_layout
+        from skillweave.spaces.packing import leaf_spaces
 
         key = part.key
         names = {path: ".".join(path) for path in self.leaves}
@@ -138,7 +138,8 @@ class _Reader:
             shape = self.leaves[paths[0]].shape
             return [self._take(paths[0], part, alone and (len(shape) > 1 or not part.one_hot))]
         if len(paths) > 1:
-            paths = [path for path in paths if image_layout(leaf_at(self.space, path)) is None]
+            leaves = leaf_spaces(self.space)
+            paths = [path for path in paths if image_layout(leaves[path]) is None]
         if not paths:
             raise PolicyError(f"{where} reads {key!r}, which has images alone: name one of them")
         takes = [self._take(path, part) for path in paths]

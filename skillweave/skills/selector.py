@@ -35,7 +35,7 @@ from skillweave.skills.goal_spaces import alone
 from skillweave.skills.outputs import Wrapped, answer, called, required_arguments
 from skillweave.skills.probing import probe
 from skillweave.skills.tree import Composite, Condition, Node, Sequence
-from skillweave.types import Array, Memory, Memoryless, Step
+from skillweave.types import Array
 
 
 class ReadySelector(Functional, Foreign):
@@ -52,7 +52,6 @@ class ReadySelector(Functional, Foreign):
 
     It is made when it is first needed, so that the skills and their goals are known; it raises a
     SkillError where a fixed goal does not fit its skill."""
-    observe = Memoryless.observe  # it watches instead
 
     def __init__(self, name: str) -> None:
         Foreign.__init__(self, name)
@@ -62,11 +61,6 @@ class ReadySelector(Functional, Foreign):
         """Return what copies have: each makes its own rule."""
         made = ("in_place", "_like")
         return {name: value for name, value in vars(self).items() if name not in made}
-
-    @property
-    def ranges(self) -> dict[str, range]:
-        """Return the valid range of each index in its memory, by name."""
-        return dict(self.in_place.values())
 
     def named(self) -> Iterable[tuple[str, str, Any]]:
         """Return the skills that its declaration names: where, their names and goals or None."""
@@ -96,41 +90,6 @@ class ReadySelector(Functional, Foreign):
         """Return what every ``Rule`` is made of: who, skills and goals."""
         goals = {name: space_of(space) for name, space in self.goal_spaces.items()}
         return self._who, self.skills, goals
-
-    def chances(self, memory: Memory, obs: Array, mask: Array) -> tuple[Array, Memory]:
-        """Return the probability of each choice where a call is over, (n, choices) float32.
-
-        Args:
-            memory: of n environments.
-            obs: (n, …).
-            mask: (n, choices) bool, what may be chosen.
-
-        Returns:
-            The probabilities, and the memory after the choice.
-        """
-        memory, own = self._copied(memory)
-        return self.in_place.chances(own, np.arange(len(obs)), obs, mask), memory
-
-    def allowed(self, memory: Memory) -> Array | None:
-        """Return the skills that it may choose next, (n, S) bool; None: depends on observations.
-
-        Args:
-            memory: of n environments.
-        """
-        skills: Array | None = self.in_place.allowed(memory, slice(None))
-        return skills
-
-    def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """Return the memory after a step of n environments; called after every step.
-
-        Args:
-            memory: of these environments.
-            step: the environments' transition; ``elapsed`` counts as for any policy.
-            last: the last calls; ``why`` is 0 (``CallEnd.RUNNING``) where the call continues.
-        """
-        memory, own = self._copied(memory)
-        self.in_place.watch(own, np.arange(len(last.why)), step, last)
-        return memory
 
     def _goal(self, name: str, goal: Any, where: str) -> Any:
         """Return a goal of ``(name, goal)`` for a rule; ``where`` it is declared, for messages."""

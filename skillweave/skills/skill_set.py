@@ -12,7 +12,6 @@ from skillweave.errors import PolicyError
 from skillweave.policies.core import Choices, Policy, innermost
 from skillweave.policies.functional import Functional, Returns
 from skillweave.policies.hierarchy import ActiveGuide, CalledSkill, Hierarchy, Interruption
-from skillweave.policies.leaves import Ready
 from skillweave.policies.parts import Corrects, Given, Joined, PartOf, Reflexes, Remembers
 from skillweave.policies.spaces import space_of
 from skillweave.skills import Reflex, Skill, path_of
@@ -113,10 +112,10 @@ def acting_policy(
     if guide is not None and guide.decides:
         selector, guide = guide.selector, None
     policy: Policy = Hierarchy(
-        None if selector is None else selects(selector, "the selector's act()"),
+        None if selector is None else in_place(selector, "the selector's act()"),
         tuple(_skill(skills, i) for i in range(len(skills.skills))),
         lengths=skills.lengths,
-        guide=guide and replace(guide, selector=selects(guide.selector, "the guide")),
+        guide=guide and replace(guide, selector=in_place(guide.selector, "the guide")),
         interruption=skills.interruption,
         fresh_calls=goals is not None,
         greedy=skills.greedy,
@@ -124,7 +123,7 @@ def acting_policy(
         ask=ask,
     )
     if skills.reflexes:
-        policy = Reflexes(policy, skills.reflexes, space_of(skills.action_space))
+        policy = _overridden(policy, skills.reflexes, skills.action_space)
     return _remembering(policy, skills) if outermost else policy
 
 
@@ -170,7 +169,13 @@ def acting_apart(
         space: of the environment's actions.
     """
     whole = _whole(policy, skill, part)
-    return Reflexes(whole, reflexes, space_of(space)) if reflexes else whole
+    return _overridden(whole, reflexes, space) if reflexes else whole
+
+
+def _overridden(policy: Policy, reflexes: tuple[Reflex, ...], space: gym.Space[Any]) -> Policy:
+    """Return a policy with reflexes."""
+    acts = space_of(space)
+    return Reflexes(policy, tuple(reflex.override(acts) for reflex in reflexes), acts)
 
 
 def _whole(policy: Any, skill: Skill | None, part: OwnPart | None) -> Policy:
@@ -227,22 +232,6 @@ def policy_of(
 
 ENDS = ("initiation", "termination", "success")
 """The methods of a skill that are asked while it acts."""
-
-
-def selects(selector: Any, who: str) -> Policy:
-    """Return a selector's policy; one that is not trained watches how calls end.
-
-    Args:
-        who: for messages.
-    """
-    if not hasattr(selector, "watch"):
-        return in_place(selector, who)
-    kind, asked = type(selector), ("start", "act", "chances", "allowed", "watch")
-    methods = (getattr(kind, name, None) for name in asked)
-    # Where the user has another way, it counts.
-    ours = all(getattr(one, "__module__", "").startswith("skillweave.") for one in methods)
-    rule: Policy | None = getattr(selector, "in_place", None) if ours else None
-    return Ready(selector, who, blame) if rule is None else rule
 
 
 def _check_memory(policy: Policy) -> None:

@@ -18,13 +18,12 @@ import numpy as np
 from torch import Tensor
 
 from skillweave.errors import EnvError
+from skillweave.policies.hierarchy import SKILL
+from skillweave.policies.parts import GOAL
 from skillweave.policies.spaces import space_of
 from skillweave.spaces.action_codec import ActionCodec, JointCodec, action_codec
 from skillweave.spaces.packing import obs_dtype
 from skillweave.types import Array
-
-SKILL, GOAL = "skill", "goal"
-"""The parts of a choice."""
 
 
 class ChoiceSpace(gym.spaces.Dict):

@@ -13,7 +13,6 @@ from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.policies.core import Around, Policy, flat
 from skillweave.policies.parts import Corrects
-from skillweave.skills import ReadySelector
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Memoryless
@@ -215,10 +214,10 @@ def test_a_correction_says_what_numbers_both_may_remember() -> None:
     assert both.values().keys() == flat(both.start(2)).keys()
 
 
-class Turns(ReadySelector):
-    """A user's own selector, which has no rule of the library."""
+class Turns(Memoryless):
+    """A user's own selector, which remembers its calls."""
 
-    kind = "turns"
+    observation_space, action_space = Pays.observation_space, gym.spaces.Discrete(2)
 
     def start(self, n: int) -> Any:
         return {"calls": np.zeros(n, np.int64)}
@@ -226,14 +225,7 @@ class Turns(ReadySelector):
     def act(self, memory: Any, obs: Any, mask: Any = None, **how: Any) -> Any:
         return memory["calls"] % 2, {"calls": memory["calls"] + 1}
 
-    def watch(self, memory: Any, step: sw.Step, last: Any) -> Any:
-        return memory
-
 
 def test_a_selector_of_the_users_own_is_a_policy() -> None:
-    one = Turns("turns")
-    memory = one.start(2)
-    assert one.observe(memory, None) is memory  # type: ignore[arg-type]
-    bound = one.bind(Pays.observation_space, gym.spaces.Discrete(2), "it")
     skills = SkillSet((First(), Second()), (Fixed(0), Fixed(2)), call_steps=1)
-    assert sw.evaluate(HierarchyPolicy(bound, skills), Pays, episodes=2).returns == (4.0, 4.0)
+    assert sw.evaluate(HierarchyPolicy(Turns(), skills), Pays, episodes=2).returns == (4.0, 4.0)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from skillweave.planning import Planner, Predicate
-from skillweave.policies.core import LIMIT
-from skillweave.skills import LastCall
+from skillweave.policies.core import LIMIT, flat, nested
+from skillweave.skills import LastCall, ReadySelector
 from skillweave.types import Array, Step
 
 
@@ -29,6 +29,13 @@ def step_to(after, before=None, **more) -> Step:
         "info": {},
     } | more
     return Step(obs=before, next_obs=after, **values)
+
+
+def watched(selector: ReadySelector, memory: Any, step: Step, last: LastCall) -> Any:
+    """The memory of a selector after it has watched a step."""
+    inside = nested(selector.in_place.start(1), {k: v.copy() for k, v in memory.items()})
+    selector.in_place.watch(inside, np.arange(len(last.why)), step, last)
+    return flat(inside)
 
 
 def column(i: int):
@@ -56,7 +63,7 @@ def assert_not_repeated(planner: Planner, ahead: Callable[[Any], Any]):
         skill = choice["skill"] if choice.dtype.fields else choice
         last = LastCall(skill, np.full(1, LIMIT, np.int8), np.zeros(1, bool))
         for _ in range(3):
-            memory = planner.watch(memory, step_to(obs, before), last)
+            memory = watched(planner, memory, step_to(obs, before), last)
     assert chosen[1]
     assert not chosen[-1]
     assert len(chosen) <= 5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from planning.steps import column, step_to
+from planning.steps import column, step_to, watched
 
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.planning import (
@@ -149,7 +149,7 @@ def test_its_automaton_is_in_the_same_states(name):
     for _ in range(40):
         step = step_to(rng.random((n, 5)) < [0.3, 0.8, 0.03, 0.05, 0.05])
         state, _, _ = task.step(state, step)
-        memory = automaton.watch(memory, step, last)
+        memory = watched(automaton, memory, step, last)
         names = [automaton.state_names[i] for i in memory["state"]]
         wanted = [
             name if not count else f"{name} ({count} steps held)"

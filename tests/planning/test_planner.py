@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from goals.worlds import Point
 from planning.logs import log_of
-from planning.steps import assert_not_repeated, at, step_to
+from planning.steps import assert_not_repeated, at, step_to, watched
 from planning.test_call_logs import SKILLS, skill_set
 from ready_selectors.chain import (
     DOOR,
@@ -293,7 +293,7 @@ def test_goals_that_observations_hold():
     choice, memory = bound.act(bound.start(3), obs)
     assert choice.tolist() == [0, 1, 0]
     last = LastCall(choice, np.full(3, CallEnd.RUNNING, np.int8), np.zeros(3, bool))
-    memory = bound.watch(memory, step_to([[4, 0], [6, 10], [3, 3]], obs), last)
+    memory = watched(bound, memory, step_to([[4, 0], [6, 10], [3, 3]], obs), last)
     assert memory["state"].tolist() == [0, 0, 1]
 
 

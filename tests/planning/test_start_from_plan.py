@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from planning.logs import log_of
-from planning.steps import step_to
+from planning.steps import step_to, watched
 from planning.untrained import run_of
 from ready_selectors.chain import (
     DOOR,
@@ -284,7 +284,7 @@ def test_a_planner_that_guides_remembers_the_calls_that_were_made():
     choice, memory = planner.act(memory, obs)
     assert choice.tolist() == [0]
     last = LastCall(np.array([1]), np.full(1, CallEnd.LIMIT, np.int8), np.zeros(1, bool))
-    memory = planner.watch(memory, step_to(obs, obs), last)
+    memory = watched(planner, memory, step_to(obs, obs), last)
     assert memory["tried.choice"][0, 0] == 1
     choice, memory = planner.act(memory, obs)
     assert choice.tolist() == [0], "what failed was not the plan's choice"

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from planning.steps import watched
 from ready_selectors.chain import Corridor, has_key, hierarchy, story
 
 from skillweave import tree
@@ -33,7 +34,7 @@ def told(policy: Any, memory: Any, succeeded: Any) -> Any:
     """The memory after calls that ended so."""
     why = np.full(len(succeeded), CallEnd.OWN, np.int8)
     called = policy.in_place.skill_of[memory["leaf"]]
-    return policy.watch(memory, None, LastCall(called, why, np.array(succeeded)))
+    return watched(policy, memory, None, LastCall(called, why, np.array(succeeded)))
 
 
 def test_a_leaf_whose_skill_was_not_called_is_asked_for_again():
@@ -44,8 +45,8 @@ def test_a_leaf_whose_skill_was_not_called_is_asked_for_again():
         skill, memory = policy.act(memory, obs)
         names += ABC[skill[0]]
         skill = skill if instead is None else np.array([instead])
-        memory = policy.watch(
-            memory, None, LastCall(skill, np.int8([CallEnd.OWN]), np.array([True]))
+        memory = watched(
+            policy, memory, None, LastCall(skill, np.int8([CallEnd.OWN]), np.array([True]))
         )
     assert names == "abbbc"
 

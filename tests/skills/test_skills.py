@@ -61,11 +61,16 @@ OBS = np.array([[0.0], [1.0], [2.0]])
 
 def test_a_reflex_overrides_the_action_where_it_holds_and_leaves_its_argument_alone():
     action = np.array([5, 5, 5])
-    overridden, holds = Reflex(lambda obs: obs[:, 0] > 0, 0).apply(
-        OBS, action, space_of(Discrete(6))
-    )
+    space = space_of(Discrete(6))
+    reflex = Reflex(lambda obs: obs[:, 0] > 0, 0).override(space)
+    overridden, holds = reflex.apply(OBS, action, space)
     assert (overridden.tolist(), holds.tolist()) == ([5, 0, 0], [False, True, True])
     assert action.tolist() == [5, 5, 5]
+
+
+def override(reflex, space):
+    acts = space_of(space)
+    reflex.override(acts).apply(OBS, acts.start(3), acts)
 
 
 def test_a_reflex_is_named_after_its_condition():
@@ -78,7 +83,7 @@ def test_a_reflex_is_named_after_its_condition():
     with pytest.raises(
         SkillweaveError, match=r"'leg_touches': condition\(\) returned shape \(2,\)"
     ):
-        reflex.apply(OBS, np.zeros(3, int), space_of(Discrete(2)))
+        override(reflex, Discrete(2))
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
@@ -196,9 +201,7 @@ def test_observations_cannot_be_changed_either(function):
     skill = type("Writes", (Skill,), {"initiation": lambda self, obs: write(obs)})()
     call = {
         "initiation": lambda obs: asked(skill, "initiation", obs),
-        "condition": lambda obs: Reflex(write, 0).apply(
-            obs, np.zeros(3, int), space_of(Discrete(2))
-        ),
+        "condition": lambda obs: Reflex(write, 0).holds(obs),
         "policy": lambda obs: from_function(write).act({}, obs),
     }[function]
     obs = OBS.copy()
@@ -222,10 +225,10 @@ def test_observations_cannot_be_changed_either(function):
 def test_a_wrong_action_of_a_reflex_is_told(action, space, says):
     reflex = Reflex(lambda obs: obs[:, 0] > 0, action, "tilted")
     with pytest.raises(SkillweaveError, match=f"reflex 'tilted': .*{says}|{says}"):
-        reflex.apply(OBS, np.zeros((3, *space.shape), space.dtype), space_of(space))
+        override(reflex, space)
     if not callable(action):
         with pytest.raises(SkillweaveError, match="reflex 'tilted'"):
-            reflex.check(space_of(space))
+            reflex.override(space_of(space))
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from skillweave import tree
 from skillweave._internal.notices import collected_notices
 from skillweave.errors import PolicyError
 from skillweave.planning import GoalTask, Predicate, RewardMachine
-from skillweave.policies.core import LastCall
+from skillweave.policies.core import LastCall, Turn, World
 from skillweave.policies.spaces import space_of
 from skillweave.skills import Automaton, Reflex, Skill, asked, from_function, ready_selector
 from skillweave.skills.foreign_policy import check_spaces
@@ -81,8 +81,14 @@ def reads(function):
 def chooses(value):
     selector = ready_selector(value, ("a", "b"))
     assert selector is not None
-    memory, last = selector.start(4), LastCall(*np.zeros((3, 4), int))
-    return lambda: (selector.act(memory, OBS), selector.watch(memory, step(), last))
+    rule, last = selector.in_place, LastCall(*np.zeros((3, 4), int))
+    rows, turn = np.arange(4), Turn(World())
+
+    def chosen() -> None:
+        rule.act(rule.start(4), rows, OBS, turn)
+        rule.watch(rule.start(4), rows, step(), last)
+
+    return chosen
 
 
 def method(name: str):
@@ -107,6 +113,7 @@ def places() -> dict[str, list[Callable[[], Any]]]:
     by_function = Automaton({"x": ("a", OfObservations())}, {}).among(("a",))
     with_goals = by_function.bind(SPACES[0], choices, "it")
     condition, reflex = Reflex(Best(), 0), Reflex(lambda obs: obs[:, 0] > -1, Best())
+    actions = space_of(SPACES[1])
     return {
         "planning.goal": [lambda: task.holds(OBS, OBS)],
         "planning.predicates": [lambda: inverse.at(OBS)],
@@ -120,7 +127,7 @@ def places() -> dict[str, list[Callable[[], Any]]]:
         ],
         "skills.base": [
             lambda: condition.holds(OBS),
-            lambda: reflex.apply(OBS, np.zeros(4, int), space_of(SPACES[1])),
+            lambda: reflex.override(actions).apply(OBS, actions.start(4), actions),
             *map(method, Skill.methods),
         ],
         "skills.foreign_policy": [lambda: check_spaces(own, *SPACES, "it", "env")],
