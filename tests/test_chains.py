@@ -109,6 +109,7 @@ def test_a_skill_that_was_never_called_is_told_in_the_end_also_after_a_stop(tmp_
     assert said.startswith("together: skill 'beyond' was never called in 5")
     run = stopped_run(never(), tmp_path / "run", 4)
     training.train(never(), run, (again,))
+    run.close()
     assert [text for text in again.said if "never called" in text] == [said]
     assert_same(run.path, tmp_path / "whole")
 

@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 
-from skillweave import Agent, Hierarchy, SkillweaveError
+from skillweave import Agent, EnvSpec, Hierarchy, SkillweaveError
 from skillweave._internal.terminal import one_line, printable
 from skillweave.cli import main
 from skillweave.runs.files import read_json, write_json
@@ -38,9 +38,13 @@ def warm() -> gym.Env:
     return Warns(gym.make("CartPole-v1"))
 
 
+# How fast it steps is not measured: the number of processes changes what is learnt.
+WARM = EnvSpec(warm, workers=1)
+
+
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory):
-    return Agent(warm, ON, STEPS).train(tmp_path_factory.mktemp("r") / "run", quiet=True).path
+    return Agent(WARM, ON, STEPS).train(tmp_path_factory.mktemp("r") / "run", quiet=True).path
 
 
 def test_controls_are_escaped_and_words_stay():
@@ -83,7 +87,7 @@ def test_training_goes_on_without_standard_error(kind, tmp_path, monkeypatch, re
     stream = streams(kind)
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", stream)
-        trained = Agent(warm, ON, STEPS).train(tmp_path / "run")
+        trained = Agent(WARM, ON, STEPS).train(tmp_path / "run")
         trained.evaluate(2)
         assert sys.stderr is stream
         if stream is not None and not stream.closed:
@@ -106,7 +110,7 @@ def test_bars_on_a_terminal_that_goes_away(tmp_path, monkeypatch, reference):
 
     with open(inner, "w") as terminal, monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", terminal)
-        trained = Agent(warm, ON, STEPS).train(tmp_path / "run", callback=leave)
+        trained = Agent(WARM, ON, STEPS).train(tmp_path / "run", callback=leave)
         assert seen != []
     assert policies(trained.path) == policies(reference)
 
@@ -243,7 +247,7 @@ def test_commands_print_a_strangers_run_escaped(commands, evil, capfd, monkeypat
 def test_errors_and_descriptions_are_escaped():
     error = SkillweaveError(f"no environment {EVIL}")
     assert not [raw for raw in RAW if raw in str(error)]
-    named = Agent(warm, ON, STEPS)
+    named = Agent(WARM, ON, STEPS)
     warm.__name__ = warm.__qualname__ = EVIL
     try:
         assert not [raw for raw in RAW if raw in repr(named) + str(named)]

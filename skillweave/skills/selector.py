@@ -57,6 +57,14 @@ class ReadySelector(Functional, Foreign):
         Foreign.__init__(self, name)
         self.skills: tuple[str, ...] = ()
 
+    def __init_subclass__(cls) -> None:
+        """Refuse methods that nobody would ask, as the rule acts."""
+        for method in {"start", "act", "watch", "chances", "allowed"} & vars(cls).keys():
+            raise DeclarationError(
+                f"{cls.__name__}.{method}() would not be asked: what is declared acts. To choose "
+                "in another way, write the selector as a function of observations"
+            )
+
     def __getstate__(self) -> dict[str, Any]:
         """Return what copies have: each makes its own rule."""
         made = ("in_place", "_like")

@@ -100,10 +100,12 @@ def test_a_schedule_leaves_no_place_for_another_one():
         PPO(learning_rate=Linear(1e-3, 0), learning_rate_schedule="kl", target_kl=0.01)
 
 
-def test_a_function_is_checked_each_time_it_is_used():
-    values = [1e-3]
-    config = PPO(learning_rate=lambda remaining: values[0])
-    values[0] = math.inf
+RATES = {"now": 1e-3}
+
+
+def test_a_function_is_checked_each_time_it_is_used(monkeypatch):
+    config = PPO(learning_rate=lambda remaining: RATES["now"])
+    monkeypatch.setitem(RATES, "now", math.inf)
     with pytest.raises(DeclarationError, match=r"returned inf; it must return a finite number"):
         rate_now(config, torch.ones(1), 0.3)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from ready_selectors.chain import Corridor, bound, got_key, hierarchy, story
 
-import skillweave as sw
 from skillweave import Automaton
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.types import Step
@@ -112,27 +111,9 @@ def test_its_checksum_is_of_its_structure():
     assert len({source(STATES, ARROWS), *others}) == len(others) + 1
 
 
-def test_a_subclass_with_another_way_to_watch_is_asked(tmp_path):
-    class Never(Automaton):
-        def watch(self, memory, step, last):
-            return memory
+def test_a_subclass_with_a_method_that_would_not_be_asked_is_refused():
+    with pytest.raises(DeclarationError, match=r"Never\.watch\(\) would not be asked"):
 
-    class One(sw.Skill):
-        call_steps = 1
-
-        def policy(self, obs):
-            return np.zeros(len(obs), int)
-
-    class Two(One):
-        pass
-
-    states, always = {"a": "one", "b": "two"}, {("a", "b"): lambda s: np.ones(len(s.reward), bool)}
-    for kind, wanted in ((Never, ["one"] * 3), (Automaton, ["one", "two", "two"])):
-        run = sw.Hierarchy("CartPole-v1", [One(), Two()], selector=kind(states, always)).train(
-            tmp_path / kind.__name__, quiet=True
-        )
-        player, seen = run.player(), []
-        for _ in range(3):
-            player.act(np.zeros(4, np.float32))
-            seen.append(run.policy.acts(player.memory))
-        assert seen == wanted
+        class Never(Automaton):
+            def watch(self, memory, step, last):
+                return memory
