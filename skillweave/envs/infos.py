@@ -225,7 +225,7 @@ def _no_number(key: str, what: str) -> EnvError:
 
 
 def allowed_rows(mask: Array | None, rows: Array) -> Array | None:
-    """Return rows of an action mask; None stays None."""
+    """Return the action masks of some environments; None: they give none."""
     return None if mask is None else mask[rows]
 
 

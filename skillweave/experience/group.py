@@ -83,7 +83,7 @@ class Collectors:
 
 
 def joined_states(states: Sequence[dict[str, Array]]) -> dict[str, Array]:
-    """Return the states of several collectors as one; see ``split_states``."""
+    """Return the states of a group's collectors as one, for a checkpoint; see ``split_states``."""
     found: dict[str, Array] = {"collectors": np.array([len(states)])}
     for i, state in enumerate(states):
         found |= prefixed(str(i), state)

@@ -131,24 +131,24 @@ def write_json(path: Path, data: Any) -> None:
 
 def json_bytes(path: Path, data: Any) -> bytes:
     """Return the bytes that ``write_json`` writes."""
-    plain = _whole(json.loads(_json(path, {"schema": SCHEMA, **as_json(data)})))
+    plain = _without_surrogates(json.loads(_json(path, {"schema": SCHEMA, **as_json(data)})))
     text = _json(path, plain | {"sha256": _digest(path, plain)}, indent=2)
     return text.encode() + b"\n"
 
 
-def _whole(data: Any) -> Any:
-    """Return JSON whose texts have no surrogates.
+def _without_surrogates(data: Any) -> Any:
+    """Return a file's JSON whose texts have no surrogates, which UTF-8 cannot hold.
 
     In a locale without all characters, Python represents some in file names as surrogates.
     """
     if isinstance(data, str):
-        return data if data.isascii() else _whole_text(data)
+        return data if data.isascii() else _text_without_surrogates(data)
     if isinstance(data, dict):
-        return {_whole(k): _whole(v) for k, v in data.items()}
-    return [_whole(x) for x in data] if isinstance(data, list) else data
+        return {_without_surrogates(k): _without_surrogates(v) for k, v in data.items()}
+    return [_without_surrogates(x) for x in data] if isinstance(data, list) else data
 
 
-def _whole_text(text: str) -> str:
+def _text_without_surrogates(text: str) -> str:
     try:
         return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
     except UnicodeEncodeError:

@@ -249,7 +249,7 @@ class Agents:
         return max(1, round(rows * together.quota / self.roles[name].row_steps))
 
     def _latest_stage(self, name: str) -> StageEntry | None:
-        """Return the latest entry of a finished stage in which ``name`` has learnt, or None."""
+        """Return the finished stage in which a learner of this one learnt last; None: in none."""
         return next(reversed(self.stage.stages_before(name)), None)
 
     def stacks(self) -> dict[str, Stack]:
