@@ -241,9 +241,10 @@ class Reader:
             dtype = np.dtype(entry["dtype"])
             kind = float if dtype.kind == "f" else bool if dtype.kind == "b" else int
             numbers = self._numbers(kind, entry["array"], f"{where}.array")
+            wide = np.int64 if kind is int and dtype != np.uint64 else dtype
             with np.errstate(over="raise"):
-                found = np.array(numbers, dtype)
-            if kind is int and found.tolist() != numbers:  # before NumPy 2 they become others
+                found = np.array(numbers, wide).astype(dtype)
+            if kind is int and found.tolist() != numbers:
                 raise OverflowError(f"not all of its numbers are of {dtype}")
         except (KeyError, TypeError, ValueError, ArithmeticError) as error:
             raise PolicyError(f"{where} is no array: {str(error)[:200]}") from error
