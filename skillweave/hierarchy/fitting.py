@@ -46,7 +46,7 @@ def check_settings(roles: Roles) -> None:
             if isinstance(config, AlgorithmConfig):
                 check_rollout(config, spaces.observation)
         for reflex in level.reflexes:
-            reflex.override(space_of(spaces.action))
+            reflex.override(space_of(spaces.action))  # raises where its fixed action does not fit
         if level.guide is not None:
             learning_guide(roles, level)
 

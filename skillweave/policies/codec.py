@@ -241,6 +241,7 @@ class Reader:
             dtype = np.dtype(entry["dtype"])
             kind = float if dtype.kind == "f" else bool if dtype.kind == "b" else int
             numbers = self._numbers(kind, entry["array"], f"{where}.array")
+            # Before NumPy 2, an array of a smaller type wraps numbers that it cannot hold.
             wide = np.int64 if kind is int and dtype != np.uint64 else dtype
             with np.errstate(over="raise"):
                 found = np.array(numbers, wide).astype(dtype)

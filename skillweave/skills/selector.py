@@ -59,10 +59,11 @@ class ReadySelector(Functional, Foreign):
 
     def __init_subclass__(cls) -> None:
         """Refuse methods that nobody would ask, as the rule acts."""
-        for method in {"start", "act", "watch", "chances", "allowed"} & vars(cls).keys():
+        for method in {"start", "act", "observe", "watch", "chances", "allowed"} & vars(cls).keys():
             raise DeclarationError(
-                f"{cls.__name__}.{method}() would not be asked: what is declared acts. To choose "
-                "in another way, write the selector as a function of observations"
+                f"{cls.__name__}.{method}() would not be asked: a ready selector acts by its "
+                "declaration alone. To choose in another way, give a function of observations as "
+                "the selector"
             )
 
     def __getstate__(self) -> dict[str, Any]:

@@ -202,7 +202,7 @@ def _end_rest_of_group() -> None:
     """End what environments have started and left: the parent, which would, may have ended."""
     if os.getpgrp() == os.getpid():
         handle_here(signal.SIGTERM, signal.SIG_IGN)
-        os.killpg(0, signal.SIGTERM)
+        _signalled(os.getpid(), signal.SIGTERM)
 
 
 def end_group(leader: int) -> None:
