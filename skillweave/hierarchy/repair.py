@@ -49,6 +49,8 @@ REHEARSED_SHARE = 0.75
 """Share of the calls that begin after the other skill, where the skill rehearses the rest."""
 LONG_CALL = 1_000
 """Steps of a call without a limit that count for its bonus."""
+COUNTS = ("calls", "done", "began_late", "needed")
+"""The arrays of a matrix."""
 SEED = 7_000
 """Seeds of measurements start here: people use smaller ones."""
 
@@ -254,10 +256,10 @@ def measure(
         may_start |= bool(may.any())
         of_skill = log.skill == number
         won = calls_done(log, done)
-        whole = (log.skill == first) & ~log.was_cut
+        whole = (log.skill == first) & ~log.began_late
         tried, succeeded = tried + int(whole.sum()), succeeded + int((whole & won).sum())
         for was_done, each in rates.items():
-            some = of_skill & (won == was_done) & ~log.was_cut
+            some = of_skill & (won == was_done) & ~log.began_late
             each.extend((returns[some] / log.tau[some]).tolist())
         following = log.followed_by
         first_calls = np.flatnonzero(following >= 0)
@@ -281,8 +283,9 @@ def measure(
 
 
 def _sum(one: Handover, other: Handover) -> Handover:
-    counts = {k: getattr(one, k) + getattr(other, k) for k in ("calls", "done", "cut")}
-    return replace(one, **counts)
+    counts = {k: getattr(one, k) + getattr(other, k) for k in ("calls", "done", "began_late")}
+    limit, needed = max(one.time_limit, other.time_limit), np.maximum(one.needed, other.needed)
+    return replace(one, **counts, time_limit=limit, needed=needed)
 
 
 def rehearsed_obs(
@@ -320,14 +323,16 @@ def rehearsed_obs(
 
 def matrix_to_json(matrix: Handover) -> Matrix:
     """Return a matrix as a run records it."""
-    calls, done, cut = (x.tolist() for x in (matrix.calls, matrix.done, matrix.cut))
-    return Matrix(list(matrix.skills), calls, done, cut, list(matrix.by_itself))
+    counts = {name: getattr(matrix, name).tolist() for name in COUNTS}
+    by_itself = list(matrix.by_itself)
+    return Matrix(list(matrix.skills), **counts, by_itself=by_itself, time_limit=matrix.time_limit)
 
 
 def matrix_from_json(entry: Matrix) -> Handover:
     """Return the matrix of ``matrix_to_json``."""
-    calls, done, cut = (np.array(x, np.int64) for x in (entry.calls, entry.done, entry.cut))
-    return Handover(tuple(entry.skills), calls, done, cut, tuple(entry.by_itself))
+    counts = {name: np.array(getattr(entry, name), np.int64) for name in COUNTS}
+    by_itself = tuple(entry.by_itself)
+    return Handover(tuple(entry.skills), **counts, by_itself=by_itself, time_limit=entry.time_limit)
 
 
 def judge_repair(

@@ -89,8 +89,7 @@ def forecast(planner: Planner) -> Forecast:
     before = log.before
     first = planner.log.start[starts[np.arange(n) * len(starts) // n]]
     fixed = [(a == b).all(0) for a, b in zip(*map(leaves, (before, log.next_obs)), strict=True)]
-    cut = planner.log.was_cut
-    limit = (planner.log.age + planner.log.tau)[cut].max(initial=0) or np.inf
+    limit = planner.log.time_limit or np.inf
     known = read_log(machine, log)
     obs, state, elapsed = first.copy(), machine.start(n), np.zeros(n, np.int64)
     may, running = np.ones((n, log.choices), bool), np.ones(n, bool)

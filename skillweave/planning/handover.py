@@ -48,17 +48,22 @@ class Handover:
         before: "start" and the skills, the rows.
         calls: (S + 1, S) int64.
         done: (S + 1, S) int64.
-        cut: (S,) int64, calls of each skill that were left out, as the episode's time limit cut
-            them.
+        began_late: (S + 1, S) int64, calls that are left out, as they began too late to run their
+            whole length before the episode's time limit.
         by_itself: skills without a ``success`` and an event of ``done``: a call of theirs is done
             if it ended by itself.
+        time_limit: the steps after which episodes are truncated; 0: none is seen.
+        needed: (S + 1, S) int64, the steps of an episode in which half of the calls that began too
+            late would have counted; 0: there were none.
     """
 
     skills: tuple[str, ...]
     calls: Array
     done: Array
-    cut: Array
-    by_itself: tuple[str, ...] = ()
+    began_late: Array
+    by_itself: tuple[str, ...]
+    time_limit: int
+    needed: Array
 
     @property
     def before(self) -> tuple[str, ...]:
@@ -143,6 +148,17 @@ class Handover:
             return "No success() is known: a call is done if it ended by itself."
         return f"A call is done if it succeeded; without success() ({names}) if it ended by itself."
 
+    @property
+    def left_out(self) -> str:
+        """A sentence on the calls that began too late; empty: there were none."""
+        late = int(self.began_late.sum())
+        if not late:
+            return ""
+        return (
+            f"Left out, as they began too late to run their whole length before the episode's time "
+            f"limit of {self.time_limit:,} steps: {late:,} call{'s' * (late != 1)}."
+        )
+
     def to_json(self) -> dict[str, Any]:
         """Return the counts, and the sentences of ``weakest``, as plain JSON."""
         return {
@@ -150,8 +166,9 @@ class Handover:
             "before": list(self.before),
             "calls": self.calls.tolist(),
             "done": self.done.tolist(),
-            "cut": self.cut.tolist(),
+            "began_late": self.began_late.tolist(),
             "by_itself": list(self.by_itself),
+            "time_limit": self.time_limit,
             "weakest": self.weakest(),
         }
 
@@ -170,10 +187,12 @@ class Handover:
 
     def __str__(self) -> str:
         """Return the matrix as a table of text: rates, calls, intervals, what is done."""
-        return f"{aligned([('after', *self.skills), *self.rows()])}\n{self.meaning}"
+        words = " ".join(filter(None, (self.meaning, self.left_out)))
+        return f"{aligned([('after', *self.skills), *self.rows()])}\n{words}"
 
     def _repr_html_(self) -> str:
-        return table(["after", *self.skills], self.rows()) + f"<p>{escape(self.meaning)}</p>"
+        words = " ".join(filter(None, (self.meaning, self.left_out)))
+        return table(["after", *self.skills], self.rows()) + f"<p>{escape(words)}</p>"
 
 
 @dataclass(frozen=True)
@@ -202,7 +221,9 @@ class Chain:
         return f"{text}{self.product:.0%} as the product {factors}"
 
 
-def pair_counts(before: Array, skill: Array, won: Array, count: int) -> tuple[Array, Array]:
+def pair_counts(
+    before: Array, skill: Array, won: Array, count: int, counts: Array | None = None
+) -> tuple[Array, Array]:
     """Return how many calls follow each skill, and how many of these were done, (S + 1, S) each.
 
     Args:
@@ -210,7 +231,10 @@ def pair_counts(before: Array, skill: Array, won: Array, count: int) -> tuple[Ar
         skill: (C,) columns.
         won: (C,) bool, the calls that were done.
         count: S.
+        counts: (C,) bool, the calls that are counted; None: all.
     """
+    if counts is not None:
+        before, skill, won = before[counts], skill[counts], won[counts]
     place, shape = before * count + skill, (count + 1, count)
     calls, done = (np.bincount(x, minlength=np.prod(shape)) for x in (place, place[won]))
     return calls.reshape(shape), done.reshape(shape)
@@ -223,12 +247,16 @@ def before_each(log: CallColumns, won: Array, only_after_done: bool = True) -> A
         won: (C,) bool, the calls that were done.
         only_after_done: as for ``CallLog.handover``.
     """
+    return np.where(log.began_late, -1, _row_of_each(log, won, only_after_done))
+
+
+def _row_of_each(log: CallColumns, won: Array, only_after_done: bool) -> Array:
+    """Return ``before_each``, with the calls that began too late."""
     before = np.full(len(log), -1)
     following = log.followed_by
     first = np.flatnonzero((following >= 0) & (won | (not only_after_done)))
     before[following[first]] = log.skill[first] + 1
     before[log.order == 0] = 0
-    before[log.was_cut & ~won] = -1
     return before
 
 
@@ -295,6 +323,21 @@ def wilson(successes: Any, trials: Any) -> tuple[Array, Array]:
     half = Z / (1 + Z * Z / safe) * np.sqrt(share * (1 - share) / safe + (Z / (2 * safe)) ** 2)
     low = np.where(n > 0, np.clip(middle - half, 0.0, 1.0), 0.0)
     return low, np.where(n > 0, np.clip(middle + half, 0.0, 1.0), 1.0)
+
+
+def began_late_words(calls: int, time_limit: int, needed: int) -> str:
+    """Return words on calls that are left out, as they began too late.
+
+    Args:
+        calls: how many.
+        time_limit: the steps after which episodes are truncated.
+        needed: the steps of an episode in which half of them would have counted.
+    """
+    return (
+        f"{calls:,} began too late to run their whole length before the episode's time limit of "
+        f"{time_limit:,} steps; that takes episodes of about {needed:,} steps, or shorter calls "
+        "(call_steps, max_steps)"
+    )
 
 
 def shown_rate(done: float, calls: float, what: str = " calls") -> str:
@@ -441,8 +484,10 @@ class LinkedCalls(CallColumns):
     ) -> Handover:
         """Count how often each skill is done after each other one.
 
-        A row counts the calls that follow a call of its skill. Calls that the episode's time limit
-        cut before they were done are left out.
+        A row counts the calls that follow a call of its skill. A call that began too late to run
+        its whole length before the episode's time limit is left out, whatever its outcome. Its
+        whole length is its limit; without one, the longest call of that skill that came to its own
+        end.
 
         Args:
             done: by skill, the event that its calls are for, in place of the skill's ``success``:
@@ -456,16 +501,31 @@ class LinkedCalls(CallColumns):
         """
         count = len(self.skills)
         won = calls_done(self, done)
-        before = before_each(self, won, only_after_done)
-        rows = np.flatnonzero(before >= 0)
-        calls, did = pair_counts(before[rows], self.skill[rows], won[rows], count)
-        cut = np.bincount(self.skill[self.was_cut & ~won], minlength=count)
+        before = _row_of_each(self, won, only_after_done)
         by_itself = tuple(
             name
             for name, judged in zip(self.skills, self.own_success, strict=True)
             if not judged and name not in (done or {})
         )
-        return Handover(self.skills, calls, did, cut, by_itself)
+        known = before >= 0
+        calls, did = pair_counts(before, self.skill, won, count, known & ~self.began_late)
+        late, _ = pair_counts(before, self.skill, won, count, known & self.began_late)
+        needed = np.zeros_like(late)
+        for i, j in np.argwhere(late > 0).tolist():
+            rows = self.began_late & (before == i) & (self.skill == j)
+            ends = self.age[rows] + self.whole_steps[self.choice[rows]]
+            needed[i, j] = np.quantile(ends, 0.5, method="higher")
+        return Handover(self.skills, calls, did, late, by_itself, self.time_limit, needed)
+
+    def _too_late(self, calls: Array) -> str:
+        """Return words on calls (k,) that began too late; empty: there are none."""
+        late = calls[self.began_late[calls]]
+        if not len(late):
+            return ""
+        needed = self.age[late] + self.whole_steps[self.choice[late]]
+        return ": " + began_late_words(
+            len(late), self.time_limit, int(np.quantile(needed, 0.5, method="higher"))
+        )
 
     @checked_names
     def chain(
@@ -490,15 +550,16 @@ class LinkedCalls(CallColumns):
             raise DeclarationError("chain() needs the names of skills: chain('left', 'right')")
         numbers = [self.number(name) for name in skills]
         won = calls_done(self, done)
-        counts = ~self.was_cut | won
-        rows = [np.flatnonzero(counts & (self.skill == number)) for number in numbers]
-        rows[0] = rows[0][self.order[rows[0]] == 0]
-        for name, some in zip(skills, rows, strict=True):
+        every = [np.flatnonzero(self.skill == number) for number in numbers]
+        every[0] = every[0][self.order[every[0]] == 0]
+        rows = [some[~self.began_late[some]] for some in every]
+        for name, some, with_late in zip(skills, rows, every, strict=True):
             if not len(some):
                 where = " at the start of an episode" if some is rows[0] else ""
                 raise RunError(
-                    f"the log has no complete call of {name!r}{where}; record more calls, chosen "
-                    "at random"
+                    f"the log has no call of {name!r}{where} that counts"
+                    + self._too_late(with_late)
+                    + "; record more calls, chosen at random"
                 )
         maps = feature_maps(self, features, np.concatenate([self.start, self.end]))
         # From the last skill back: the chance that the rest of the chain is done after each call.
@@ -582,12 +643,14 @@ class LinkedCalls(CallColumns):
         wanted = 0 if after == START else self.number(after) + 1
         won = calls_done(self, done)
         counts = self.skill == number
-        before = before_each(self, won)
+        every = _row_of_each(self, won, only_after_done=True)
+        before = np.where(self.began_late, -1, every)
         rows = np.flatnonzero(counts & (before == wanted))
         if not len(rows):
             raise RunError(
-                f"the log has no call of {skill!r} after a call of {after!r} that was done; record "
-                "more calls, chosen at random"
+                f"the log has no call of {skill!r} after a call of {after!r} that was done"
+                + self._too_late(np.flatnonzero(counts & (every == wanted)))
+                + "; record more calls, chosen at random"
             )
         others = np.flatnonzero(counts & (before >= 0) & (before != wanted))
         nan, did = float("nan"), won[rows]
@@ -600,7 +663,7 @@ class LinkedCalls(CallColumns):
         if after == START or len(rows) < LEAST:
             return unknown
         maps = feature_maps(self, features, self.start)
-        known = np.flatnonzero(counts & (~self.was_cut | won))
+        known = np.flatnonzero(counts & ~self.began_late)
         starts, of_first = self.flat(self.start), self.skill[self.owner] == self.number(after)
         changes = (self.flat(self.before[of_first]) != self.flat(self.next_obs[of_first])).any(0)
         # Where a number that the first skill does not change decides, none of its ends is better.

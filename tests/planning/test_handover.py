@@ -21,10 +21,10 @@ def log() -> CallLog:
     return log_of(
         ["go", "stay"],
         [
-            (0, [(A, [1, 2], True, "own"), (B, [2, 2, 2], True, "limit"), (A, [3], True, "end")]),
+            (0, [(A, [1, 2], True, "own"), (B, [2, 2], True, "limit"), (A, [3], True, "end")]),
             (0, [(A, [1, 2], True, "own"), (B, [2, 4], False, "limit"), (A, [5], False, "limit")]),
-            (1, [(B, [1, 1, 1], True, "limit"), (B, [9], False, "cut")]),
-            (1, [(A, [1], False, "limit"), (A, [2], True, "own"), (A, [3], True, "cut")]),
+            (1, [(B, [1, 1, 1, 1], True, "limit"), (B, [9, 9], False, "cut")]),
+            (1, [(A, [1], False, "limit"), (A, [2], True, "own"), (A, [3] * 4, True, "cut")]),
         ],
     )
 
@@ -35,7 +35,9 @@ def test_the_matrix_by_hand(log):
     # After "go": B won, B lost, A won (though the limit came then). After a lost call: nothing.
     assert matrix.calls.tolist() == [[3, 1], [1, 2], [1, 0]]
     assert matrix.done.tolist() == [[2, 1], [1, 1], [1, 0]]
-    assert matrix.cut.tolist() == [0, 1]
+    # The second "stay" of the third episode began 2 steps before its limit, and another has 4.
+    assert matrix.began_late.tolist() == [[0, 0], [0, 0], [0, 1]]
+    assert (matrix.time_limit, matrix.needed[2, 1]) == (6, 8)
     assert matrix.of("stay", after="go") == (0.5, 2)
     assert np.isnan(matrix.rate[2, 1])
     any_end = log.handover(only_after_done=False)
@@ -49,9 +51,9 @@ def test_done_may_be_an_event_inside_the_call(log):
 
     # "stay" is done where two steps in succession end at 2, "go" where one does.
     matrix = log.handover({"stay": held(at_two, 2), "go": at_two})
-    assert matrix.calls.tolist() == [[3, 1], [0, 2], [1, 0]]
+    assert matrix.calls.tolist() == [[3, 1], [1, 2], [1, 0]]
     assert matrix.done.tolist() == [[2, 0], [0, 1], [0, 0]]
-    assert matrix.cut.tolist() == [1, 1]
+    assert not matrix.began_late.any()  # no call of "stay" was done before it
 
 
 def test_intervals():
@@ -134,9 +136,11 @@ def test_a_skill_that_is_never_done_is_the_weakest():
 def test_what_counts_without_a_success_is_said(log):
     matrix = log.handover()
     assert matrix.by_itself == ()
-    assert str(matrix).endswith("A call is done if it succeeded.")
+    assert "A call is done if it succeeded." in str(matrix)
+    assert str(matrix).endswith("time limit of 6 steps: 1 call.")
+    assert not replace(log, known_time_limit=0).handover().left_out
     some = replace(log, own_success=(True, False))
-    assert str(some.handover()).endswith("without success() (stay) if it ended by itself.")
+    assert "without success() (stay) if it ended by itself." in str(some.handover())
     none = replace(log, own_success=(False, False)).handover()
     assert "<p>No success() is known: a call is" in none._repr_html_()
     broken = replace(walks(600, 1), own_success=(False,) * 3).handover().weakest()
@@ -147,7 +151,7 @@ def test_sentences_of_chains_and_ends(log):
     assert str(log.chain("go")) == ("go: 67% along the logged calls; 67% as the product 67% of 3")
     assert " then on: " in str(walks(60, 0).chain("back", "there", "on"))
     assert str(log.call_ends("stay")) == (
-        "stay: 4 calls of 2.2 steps, of which 50% succeeded; ends: own 0%, limit 75%, "
+        "stay: 4 calls of 2.5 steps, of which 50% succeeded; ends: own 0%, limit 75%, "
         "interrupted 0%, episode 25%"
     )
     assert log.call_ends("stay").quantiles[1].tolist() == [3.0]
@@ -165,7 +169,7 @@ def test_sentences_of_chains_and_ends(log):
         (
             lambda log: log.take(np.array([1, 2])).chain("go", "stay"),
             RunError,
-            "no complete call of 'go' at the start of an episode",
+            "no call of 'go' at the start of an episode that counts; record",
         ),
         (lambda log: log.of("go").call_ends("stay"), RunError, "no call of 'stay'"),
         (
