@@ -49,8 +49,6 @@ REHEARSED_SHARE = 0.75
 """Share of the calls that begin after the other skill, where the skill rehearses the rest."""
 LONG_CALL = 1_000
 """Steps of a call without a limit that count for its bonus."""
-COUNTS = ("calls", "done", "began_late", "needed")
-"""The arrays of a matrix."""
 SEED = 7_000
 """Seeds of measurements start here: people use smaller ones."""
 
@@ -284,8 +282,10 @@ def measure(
 
 def _sum(one: Handover, other: Handover) -> Handover:
     counts = {k: getattr(one, k) + getattr(other, k) for k in ("calls", "done", "began_late")}
-    limit, needed = max(one.time_limit, other.time_limit), np.maximum(one.needed, other.needed)
-    return replace(one, **counts, time_limit=limit, needed=needed)
+    limit = max(one.time_limit, other.time_limit)
+    assert one.needed is not None
+    assert other.needed is not None
+    return replace(one, **counts, time_limit=limit, needed=np.maximum(one.needed, other.needed))
 
 
 def rehearsed_obs(
@@ -323,16 +323,19 @@ def rehearsed_obs(
 
 def matrix_to_json(matrix: Handover) -> Matrix:
     """Return a matrix as a run records it."""
-    counts = {name: getattr(matrix, name).tolist() for name in COUNTS}
-    by_itself = list(matrix.by_itself)
-    return Matrix(list(matrix.skills), **counts, by_itself=by_itself, time_limit=matrix.time_limit)
+    calls, done, late = (x.tolist() for x in (matrix.calls, matrix.done, matrix.began_late))
+    needed = None if matrix.needed is None else matrix.needed.tolist()
+    by_itself, limit = list(matrix.by_itself), matrix.time_limit
+    return Matrix(list(matrix.skills), calls, done, late, by_itself, limit, needed)
 
 
 def matrix_from_json(entry: Matrix) -> Handover:
     """Return the matrix of ``matrix_to_json``."""
-    counts = {name: np.array(getattr(entry, name), np.int64) for name in COUNTS}
-    by_itself = tuple(entry.by_itself)
-    return Handover(tuple(entry.skills), **counts, by_itself=by_itself, time_limit=entry.time_limit)
+    columns = (entry.calls, entry.done, entry.began_late)
+    calls, done, late = (np.array(x, np.int64) for x in columns)
+    needed = None if entry.needed is None else np.array(entry.needed, np.int64)
+    by_itself, limit = tuple(entry.by_itself), entry.time_limit
+    return Handover(tuple(entry.skills), calls, done, late, by_itself, limit, needed)
 
 
 def judge_repair(

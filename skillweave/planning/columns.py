@@ -160,12 +160,9 @@ class CallColumns(Choices):
     @cached_property
     def whole_steps(self) -> Array:
         """The steps of a whole call of each choice, (choices,) int64; see ``whole_steps``."""
-        return whole_steps(
-            self.choice,
-            self.tau,
-            (self.end_reason == CallEnd.OWN) | self.terminated,
-            limits_of_choices(self, self.limits or (None,) * len(self.skills)),
-        )
+        limits = limits_of_choices(self, self.limits or (None,) * len(self.skills))
+        complete = (self.end_reason == CallEnd.OWN) | self.terminated
+        return whole_steps(self.choice, self.tau, complete, self.was_cut, limits)
 
     @cached_property
     def began_late(self) -> Array:
@@ -279,22 +276,26 @@ def limits_of_choices(choices: Choices, limits: Sequence[int | None]) -> Array:
     return np.array([min((x for x in pair if x is not None), default=0) for pair in both], np.int64)
 
 
-def whole_steps(choice: Array, steps: Array, complete: Array, limits: Array) -> Array:
+def whole_steps(
+    choice: Array, steps: Array, complete: Array, was_cut: Array, limits: Array
+) -> Array:
     """Return the steps of a whole call of each choice, (choices,) int64.
 
-    They are its limit; without one, the steps of the longest call that came to its own end, and of
-    the longest of all where none did.
+    They are its limit. Without one, they are those of the longest call that came to its own end, or
+    of the longest of all where none did; and 0 where no call was cut, as nothing is unknown then.
 
     Args:
         choice: (C,) of each call.
         steps: (C,) of each call.
         complete: (C,) bool, the call ended by itself, or the episode terminated.
+        was_cut: (C,) bool, the episode's time limit cut the call.
         limits: see ``limits_of_choices``.
     """
     longest, longest_complete = (np.zeros(len(limits), np.int64) for _ in range(2))
     np.maximum.at(longest, choice, steps)
     np.maximum.at(longest_complete, choice[complete], steps[complete])
     unlimited = np.where(longest_complete > 0, longest_complete, longest)
+    unlimited[np.bincount(choice[was_cut], minlength=len(limits)) == 0] = 0
     return np.where(limits > 0, limits, unlimited)
 
 

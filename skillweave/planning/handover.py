@@ -54,16 +54,16 @@ class Handover:
             if it ended by itself.
         time_limit: the steps after which episodes are truncated; 0: none is seen.
         needed: (S + 1, S) int64, the steps of an episode in which half of the calls that began too
-            late would have counted; 0: there were none.
+            late would have counted, 0: there were none; None: unknown.
     """
 
     skills: tuple[str, ...]
     calls: Array
     done: Array
     began_late: Array
-    by_itself: tuple[str, ...]
-    time_limit: int
-    needed: Array
+    by_itself: tuple[str, ...] = ()
+    time_limit: int = 0
+    needed: Array | None = None
 
     @property
     def before(self) -> tuple[str, ...]:

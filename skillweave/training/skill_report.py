@@ -201,8 +201,9 @@ def _time_limit(rows: Array) -> int:
 def _began_late(recorder: Recorder, rows: Array, time_limit: int) -> Array:
     """Return the calls of a level that began too late to count, (C,) bool."""
     complete = (rows["end_reason"] == CallEnd.OWN) | rows["terminated"]
+    was_cut = (rows["end_reason"] == CallEnd.EPISODE) & rows["truncated"] & ~rows["terminated"]
     limits = limits_of_choices(recorder.skills, recorder.limits)
-    whole = whole_steps(rows["choice"], rows["steps"], complete, limits)
+    whole = whole_steps(rows["choice"], rows["steps"], complete, was_cut, limits)
     return began_late(rows["age"], whole[rows["choice"]], time_limit)
 
 

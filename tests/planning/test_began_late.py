@@ -51,6 +51,10 @@ def test_without_a_limit_the_longest_call_that_came_to_its_own_end_counts():
     assert late_of([stuck, *episodes], (None, None)) == [False, False, False, True]
     # Where none came to its end, the longest does.
     assert late_of([stuck, RAN_OUT], (None, None)) == [False, True]
+    # Where none was cut, as it ends with the episode, say, each is known to its end.
+    until_then = [full(0, (10, "end", True)), *episodes, full(9, (1, "own", True))]
+    of_a = (0, [(A, [0] * 10, False, "cut")])
+    assert late_of([of_a, *until_then], (None, None)) == [False] * 5
 
 
 def test_a_call_that_began_with_its_episode_is_never_too_late():
