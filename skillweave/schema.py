@@ -65,6 +65,10 @@ AtLeastOne = Annotated[int, Check("at least 1", lambda x: x >= 1)]
 """A whole number of at least 1."""
 Count = Annotated[int, Check("at least 0", lambda x: x >= 0)]
 """A whole number of at least 0."""
+Amount = Annotated[int, Check("at least 1 and at most 1,000,000", lambda x: 1 <= x <= 1_000_000)]
+"""A whole number of at least 1, of what takes memory or time each."""
+Threads = Annotated[int, Check("at least 1 and at most 1,024", lambda x: 1 <= x <= 1024)]
+"""A number of threads or processes."""
 Positive = Annotated[float, Check("positive and finite", lambda x: x > 0)]
 """A number above 0."""
 NonNegative = Annotated[float, Check("at least 0 and finite", lambda x: x >= 0)]
@@ -265,7 +269,12 @@ class _Fitting:
         if origin in (list, tuple, Sequence) and inner:
             return self._sequence(origin, inner, value, path)
         if origin in (dict, Mapping) and inner:
-            return {k: self.fit(inner[1], v, f"{path}[{short(k)}]") for k, v in value.items()}
+            return {
+                self.fit(inner[0], k, f"{path}: a name"): self.fit(
+                    inner[1], v, f"{path}[{short(k)}]"
+                )
+                for k, v in value.items()
+            }
         if isinstance(value, Mapping) and _is_record(kind):
             return self._record(kind, value, path)
         return value

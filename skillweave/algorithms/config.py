@@ -19,17 +19,24 @@ from skillweave.errors import DeclarationError, EnvError, RunError
 from skillweave.networks.config import Network, check_critic
 from skillweave.policies.files import shown
 from skillweave.schema import (
+    Amount,
     AtLeastOne,
     Check,
     Count,
     Fraction,
     NonNegative,
     Positive,
+    Threads,
     check,
     fit,
     settings,
     to_json,
 )
+
+MOST_ROWS = 1_000_000_000
+"""The most steps that a rollout or a buffer holds."""
+Rows = Annotated[int, Check(f"at least 1 and at most {MOST_ROWS:,}", lambda x: 1 <= x <= MOST_ROWS)]
+"""A number of steps that are held in memory."""
 
 
 @settings
@@ -40,9 +47,9 @@ class OnPolicy:
         DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    num_envs: AtLeastOne = 64
+    num_envs: Amount = 64
     """Environments stepped side by side."""
-    n_steps: AtLeastOne = 64
+    n_steps: Amount = 64
     """Environment steps of each environment between updates, for selectors too."""
     learning_rate: LearningRate = 1e-3
     """Adam's step size, at the start; or ``Linear(start, end)``, or a function of the share of the
@@ -55,7 +62,7 @@ class OnPolicy:
     """The actor's network."""
     overlap: bool = True
     """Collect the next rollout while learning from the last: the data is one update old."""
-    threads: AtLeastOne = 1
+    threads: Threads = 1
     """Torch threads while learning."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Device of learning; auto: a GPU if available. Acting runs on the CPU."""
@@ -63,6 +70,9 @@ class OnPolicy:
     def __post_init__(self) -> None:
         check_critic(self)
         check_rate(self)
+        rows = self.num_envs * self.n_steps
+        rule = f"at most {MOST_ROWS // self.num_envs:,} with {self.num_envs:,} environments"
+        check(self, "n_steps", rows <= MOST_ROWS, rule)
 
 
 @settings
@@ -75,7 +85,7 @@ class PPO(OnPolicy):
 
     batch_size: AtLeastOne = 256
     """Approximate samples of a gradient step (a minibatch); a smaller rollout is one minibatch."""
-    update_epochs: AtLeastOne = 10
+    update_epochs: Amount = 10
     """Passes over each rollout."""
     learning_rate_schedule: Literal["constant", "linear", "kl"] = "linear"
     """constant; linear: falls to 0 over the budget; kl: follows target_kl. Counts where
@@ -150,9 +160,9 @@ class SelfImitationPPO(PPO):
         DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    imitation_rows: AtLeastOne = 4096
+    imitation_rows: Rows = 4096
     """The latest good rows that are kept."""
-    imitation_steps: AtLeastOne = 8
+    imitation_steps: Amount = 8
     """The most gradient steps on kept rows after each update, each on ``batch_size`` rows; at most
     one pass over the kept rows."""
     imitation_coef: NonNegative = 1.0
@@ -176,7 +186,7 @@ class SkillCritic(OnPolicy):
 
     batch_size: AtLeastOne = 256
     """Approximate samples of one gradient step."""
-    update_epochs: AtLeastOne = 2
+    update_epochs: Amount = 2
     """Passes over each rollout."""
     gae_lambda: Fraction = 0.95
     """λ of the returns that the critic learns."""
@@ -206,21 +216,19 @@ Schedule = Literal["constant", "linear"]
 class OffPolicy:
     """Settings that all algorithms with a replay buffer share."""
 
-    num_envs: AtLeastOne = 8
+    num_envs: Amount = 8
     """Environments stepped side by side."""
     train_freq: AtLeastOne = 1
     """Steps of each environment between updates."""
     update_ratio: Positive = 1.0
     """Gradient steps per transition collected (the update-to-data ratio)."""
-    buffer_size: AtLeastOne = 1_000_000
+    buffer_size: Rows = 1_000_000
     """Transitions that the replay buffer holds."""
     learning_starts: Count = 5_000
     """Environment steps taken by acting at random before the first gradient step."""
-    batch_size: Annotated[
-        int, Check("at least 1 and at most 1,000,000", lambda x: 1 <= x <= 1_000_000)
-    ] = 256
+    batch_size: Amount = 256
     """Samples of one gradient step."""
-    n_step: AtLeastOne = 1
+    n_step: Amount = 1
     """Steps of reward in a target before it bootstraps (Sutton 1988)."""
     prioritized: bool = False
     """Sample by the size of the last error (Schaul et al. 2016)."""
@@ -258,9 +266,9 @@ class OffPolicy:
     one random action (as in εz-greedy exploration, Dabney et al. 2021). It explores behaviour that
     takes many equal steps, like resting on the ground with the engines off. Falls to 0 over the
     budget. Only for policies that act in every step: plain agents, and skills that learn apart."""
-    action_repeat_steps: AtLeastOne = 60
+    action_repeat_steps: Amount = 60
     """The longest repetition, in steps; lengths are drawn uniformly."""
-    threads: AtLeastOne = 1
+    threads: Threads = 1
     """Torch threads while learning."""
     compile: bool | Literal["auto"] = False
     """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute;
@@ -303,7 +311,9 @@ class DQN(OffPolicy):
     """Exploration by learnt noise in the weights instead of ε (Fortunato et al. 2018)."""
     distributional: bool = False
     """C51: the distribution of returns on fixed atoms (Bellemare et al. 2017)."""
-    n_atoms: Annotated[int, Check("at least 2", lambda x: x >= 2)] = 51
+    n_atoms: Annotated[
+        int, Check("at least 2 and at most 100,000", lambda x: 2 <= x <= 100_000)
+    ] = 51
     """C51's atoms."""
     v_min: float | None = None
     """C51's smallest return; None: −10 times the root mean square of the returns so far, which is
@@ -379,7 +389,7 @@ class ActorCritic(OffPolicy):
 class TD3(ActorCritic):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018)."""
 
-    n_step: AtLeastOne = 3
+    n_step: Amount = 3
     """Steps of reward in a target before it bootstraps (Sutton 1988)."""
     exploration_noise: NonNegative = 0.2
     """Deviation of the noise on actions, where a bounded range spans [−1, 1]."""

@@ -26,7 +26,7 @@ from skillweave.envs.pool import MakePool, envpool, takes_ids
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError
 from skillweave.policies.infos import batched_infos
 from skillweave.policies.spaces import space_of
-from skillweave.schema import AtLeastOne, Check, check_fields, to_json
+from skillweave.schema import Check, Threads, check_fields, to_json
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.spaces.packing import parts
 
@@ -107,7 +107,7 @@ class EnvSpec:
     kwargs: dict[str, Any] = field(default_factory=dict)
     wrappers: Wrappers = ()
     engine: EngineName = "auto"
-    workers: AtLeastOne | None = None
+    workers: Threads | None = None
     pool: PoolMaker | None = None
     # These do not make a different environment.
     obs_names: Names | None = field(default=None, compare=False, repr=False)

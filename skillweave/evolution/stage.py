@@ -61,7 +61,7 @@ class EvolvingPopulation:
     def __init__(self, stage: StageRun, selection: Any = None, where: Placement = LOCAL) -> None:
         self.entry, self.run, self.seeds = stage.entry, stage.run, stage.seeds
         self.task, self.config = stage.learning_task, stage.config
-        label = f"{stage.run.path}: stage {stage.entry.name!r}"
+        label = f"{stage.run.path / 'run.json'}: stage {stage.entry.name!r}"
         self.evolution = evolution_from_json(stage.entry.evolution or {}, label, selection)
         self.best: Best | None = None
         self.done = 0

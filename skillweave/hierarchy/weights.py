@@ -30,7 +30,7 @@ from skillweave.hierarchy.recorded import (
 )
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.policies.files import shown
-from skillweave.runs.files import read_tensors, record_in, write_tensors
+from skillweave.runs.files import LARGEST_WEIGHTS, read_tensors, record_in, write_tensors
 from skillweave.runs.manifest import GuideEntry, Recorded
 from skillweave.runs.user_code import environment_texts, notice_changes
 from skillweave.skills.foreign_policy import Foreign, as_recorded
@@ -124,7 +124,7 @@ def open_weights(path: Path) -> tuple[dict[str, Tensor], AgentHeader | Hierarchy
     Raises:
         RunError: the file is damaged, or of another kind.
     """
-    tensors, header = read_tensors(path)
+    tensors, header = read_tensors(path, 8 * LARGEST_WEIGHTS)
     kind = header.get("kind")
     if kind == "agent" and "algorithm" in header:
         agent: AgentHeader = record_in(AgentHeader, header, path)

@@ -109,7 +109,7 @@ def read_calls(path: str | Path) -> dict[str, Any]:
         RunError: the file is missing, damaged, or holds no log of calls.
     """
     path = as_path(path, "load(): path")
-    tensors, header = read_tensors(path)
+    tensors, header = read_tensors(path, most=None)
     if header.get("kind") != CallsHeader.kind:
         raise RunError(f"{path} holds no log of calls; give a file that CallLog.save() wrote")
     of: CallsHeader = record_in(CallsHeader, header, path)

@@ -21,9 +21,11 @@ import numpy as np
 
 from . import actor, hierarchy, leaves, mapped, parts, plan, planned, selectors, spaces
 from .actor import Deployed
+from .archives import numbers_in, unzipped
+from .budget import BUDGET, cost
 from .core import Array
 from .errors import PolicyError, RunError
-from .files import checksum, parse_json, read_file, shown
+from .files import checksum, parse_json, read_file, shown, shown_text
 
 FORMAT = 3
 """Version of ``policy.json``."""
@@ -33,8 +35,18 @@ ARRAYS = "arrays.npz"
 """The name of the file with its large arrays."""
 SMALL = 64
 """The most numbers of an array that stands in the JSON."""
-LARGEST = 100_000_000
-"""The most bytes of ``policy.json``."""
+LARGEST = 16 * 2**20
+"""The most bytes of ``policy.json``: its large arrays are in a file of their own."""
+MOST_FILES = 2**31
+"""The most bytes of all files beside it."""
+MOST_ARRAYS = 2**30
+"""The most bytes of all arrays, once they are unpacked."""
+LONGEST_NAME = 200
+"""The most characters of a file's name."""
+LONGEST_ERROR = 1_000
+"""The most characters of a message about a field: names and spaces in it are from the file."""
+MOST_SHOWN = 20
+"""The most functions of the field ``code`` that a message lists."""
 ROOMS = (actor, hierarchy, leaves, mapped, parts, plan, planned, selectors, spaces)
 
 OTHERS = (parts.Given, parts.Viewed, plan.Near, selectors.Rule)
@@ -180,6 +192,8 @@ class Reader:
     files: Mapping[str, bytes]
     arrays: Mapping[str, Array]
     small: int = SMALL
+    left: int = BUDGET
+    """The bytes that further objects may take."""
 
     def read(self, kind: Any, entry: Any, where: str) -> Any:
         """Return the value of an entry, which must be of a kind: any annotation of a field.
@@ -187,13 +201,11 @@ class Reader:
         Raises:
             PolicyError: it is not; the message names the place ``where``.
         """
-        options = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
-        forms = [_form(option, entry) for option in options]
-        fitting = [option for option, (fits, _) in zip(options, forms, strict=True) if fits]
+        options = _options(kind)
+        fitting = [option for option in options if _fits(*option, entry)]
         if len(fitting) != 1:
-            raise _unfit(where, entry, " or ".join(wanted for _, wanted in forms))
-        kind = fitting[0]
-        origin, inner = get_origin(kind), get_args(kind)
+            raise _unfit(where, entry, " or ".join(_wanted(*option) for option in options))
+        kind, origin, inner = fitting[0]
         if kind is float:
             return float(entry["float"]) if isinstance(entry, dict) else float(entry)
         if kind is int or kind in PLAIN or origin is Literal:
@@ -211,14 +223,14 @@ class Reader:
             pairs = enumerate(zip(some, entry, strict=True))
             return tuple(self.read(k, x, f"{where}[{i}]") for i, (k, x) in pairs)
         if origin is dict:
-            return {k: self.read(inner[1], x, f"{where}[{k!r}]") for k, x in entry.items()}
+            return {k: self.read(inner[1], x, f"{where}[{shown(k)}]") for k, x in entry.items()}
         return self._object(entry, where)
 
     def _object(self, entry: dict[str, Any], where: str) -> Any:
         made: Any = kinds()[entry["type"]]
         own, values = written_fields(made), dict[str, Any]()
         if wrong := [name for name in entry if name not in own and name != "type"]:
-            near = get_close_matches(str(wrong[0]), own, 1)
+            near = get_close_matches(str(wrong[0])[:60], own, 1)
             hint = f": is {near[0]!r} meant?" if near else f"; there are: {', '.join(own)}"
             raise PolicyError(f"{where}.{shown(wrong[0])} is unknown{hint}")
         if "who" in made.__dataclass_fields__ and "who" not in own:
@@ -228,6 +240,9 @@ class Reader:
                 values[name] = self.read(kind, entry[name], f"{where}.{name}")
             elif one.default is MISSING and one.default_factory is MISSING:
                 raise PolicyError(f"{where} has no field {name!r}")
+        self.left -= cost(made, values)
+        if self.left < 0:
+            raise PolicyError(f"{where}: acting would take more than {BUDGET:,} bytes in all")
         try:
             return made(**values)
         except PolicyError as error:
@@ -237,8 +252,11 @@ class Reader:
         if "stored" in entry:
             found: Array = self._beside(self.arrays, entry["stored"], where, ARRAYS)
             return found
+        name = entry.get("dtype")
+        if not isinstance(name, str) or not spaces.DTYPE.fullmatch(name):
+            raise PolicyError(f"{where} is no array: its dtype is {shown(name)}")
         try:
-            dtype = np.dtype(entry["dtype"])
+            dtype = np.dtype(name)
             kind = float if dtype.kind == "f" else bool if dtype.kind == "b" else int
             numbers = self._numbers(kind, entry["array"], f"{where}.array")
             # Before NumPy 2, an array of a smaller type wraps numbers that it cannot hold.
@@ -249,7 +267,7 @@ class Reader:
                 raise OverflowError(f"not all of its numbers are of {dtype}")
         except (KeyError, TypeError, ValueError, ArithmeticError) as error:
             raise PolicyError(f"{where} is no array: {str(error)[:200]}") from error
-        if dtype.kind not in "biuf" or found.size > self.small:
+        if found.size > self.small:
             raise PolicyError(f"{where} is no array of at most {self.small} numbers")
         return found
 
@@ -266,34 +284,60 @@ class Reader:
         return table[name]
 
 
-def _form(kind: Any, entry: Any) -> tuple[bool, str]:
-    """Return whether an entry has the form of a kind, and what this form is, for messages."""
-    origin, inner = get_origin(kind), get_args(kind)
-    given = entry if isinstance(entry, dict) else {}
+@cache
+def _options(kind: Any) -> tuple[tuple[Any, Any, tuple[Any, ...]], ...]:
+    """Return the kinds of a union, or the only one; each with its origin and what is inside."""
+    options = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    return tuple((option, get_origin(option), get_args(option)) for option in options)
+
+
+@cache
+def _types(kind: Any) -> dict[str, type[Any]]:
+    """Return the types that may be written for a kind, by name."""
+    return {name: one for name, one in kinds().items() if issubclass(one, kind)}
+
+
+def _fits(kind: Any, origin: Any, inner: tuple[Any, ...], entry: Any) -> bool:
+    """Return whether an entry has the form of a kind."""
+    if kind in PLAIN:
+        return type(entry) is kind
     whole = type(entry) is int and abs(entry) < 2**63
     if kind is int:
-        return whole, "a whole number"
-    if kind is float:
-        infinite = given.get("float") in ("inf", "-inf")
-        return whole or type(entry) is float or infinite, "a number"
-    if kind in PLAIN:
-        return type(entry) is kind, PLAIN[kind]
-    if origin is Literal:
-        known = isinstance(entry, str | int) and entry in inner
-        return known, f"one of {', '.join(map(repr, inner))}"
+        return whole
     if origin is tuple:
-        return isinstance(entry, list), "a list"
+        return isinstance(entry, list)
+    if origin is Literal:
+        return isinstance(entry, str | int) and entry in inner
+    given = entry if isinstance(entry, dict) else {}
+    if kind is float:
+        return whole or type(entry) is float or given.get("float") in ("inf", "-inf")
     if kind == Array:
-        return isinstance(given.get("stored"), str) or "array" in given, "an array"
+        return isinstance(given.get("stored"), str) or "array" in given
     if kind is bytes or origin is Callable:
         name = "file" if kind is bytes else "code"
-        named = set(given) == {name} and isinstance(given[name], str)
-        return named, f'{{"{name}": its name}}'
+        return set(given) == {name} and isinstance(given[name], str)
     if origin is dict:
-        return isinstance(entry, dict) and "type" not in entry, "an object"
-    options = [name for name, one in kinds().items() if issubclass(one, kind)]
-    wanted = f'an object whose field "type" is one of {", ".join(options)}'
-    return given.get("type") in options, wanted
+        return isinstance(entry, dict) and "type" not in entry
+    name = given.get("type")
+    return isinstance(name, str) and name in _types(kind)
+
+
+def _wanted(kind: Any, origin: Any, inner: tuple[Any, ...]) -> str:
+    """Return a description of the form of a kind, for messages."""
+    plain: dict[Any, str] = {**PLAIN, int: "a whole number", float: "a number"}
+    if kind in plain:
+        return plain[kind]
+    if origin is Literal:
+        return f"one of {', '.join(map(repr, inner))}"
+    if origin is tuple:
+        return "a list"
+    if kind == Array:
+        return "an array"
+    if kind is bytes or origin is Callable:
+        return f'{{"{"file" if kind is bytes else "code"}": its name}}'
+    if origin is dict:
+        return "an object"
+    return f'an object whose field "type" is one of {", ".join(_types(kind))}'
 
 
 PLAIN = {bool: "true or false", str: "a text", NoneType: "null"}
@@ -325,15 +369,8 @@ def read_folder(
     """
     folder, code = Path(path), dict(code or {})
     file = folder / MANIFEST
-    read: dict[str, bytes] = {}
-    kept = None if archive is None else zipfile.ZipFile(io.BytesIO(archive))
-
-    def opened(name: str, most: int | None = None) -> bytes:
-        found = read_file(folder / name, most) if kept is None else kept.read(name)
-        read[name] = found
-        return found
-
-    content = parse_json(opened(MANIFEST, LARGEST), file)
+    opened = _Folder(folder, archive)
+    content = parse_json(opened.read(MANIFEST, LARGEST), file)
     version = content.get("format") if isinstance(content, dict) else None
     if version != FORMAT:
         raise RunError(
@@ -345,31 +382,78 @@ def read_folder(
             raise RunError(f"{file} is damaged: no field {name!r}")
         if not isinstance(content[name], kind):
             raise RunError(f"{file}: {name} is {shown(content[name])}; it must be {kind.__name__}")
-    if missing := {name: what for name, what in content["code"].items() if name not in code}:
-        raise PolicyError(
-            f"{folder} needs Python code, code={{name: function}}, for "
-            + "; ".join(f"{name!r}: {what}" for name, what in missing.items())
-        )
+    for name in ("files", "code"):
+        for key, text in content[name].items():
+            if not isinstance(text, str):
+                raise RunError(f"{file}: {name}[{shown(key)}] is {shown(text)}; it must be str")
+    _check_code(folder, content["code"], code)
     files = {name: _content(folder, name, x, opened) for name, x in content["files"].items()}
     try:
         arrays = _arrays(files.pop(ARRAYS, b""))
         reader = Reader({name: code[name] for name in content["code"]}, files, arrays)
         found: Deployed = reader.read(Deployed, content["policy"], "policy")
         found.policy.check(found.sees, found.acts, None, "policy")
+        if found.policy.holds:
+            raise PolicyError("policy holds the last action, but nothing remembers it (Remembers)")
     except PolicyError as error:
-        raise RunError(f"{file}: {error}") from error
-    return found, content, archive or _archived(read)
+        raise RunError(f"{file}: {str(error)[:LONGEST_ERROR]}") from error
+    return found, content, archive or _archived(opened.content)
 
 
 FIELDS = {"env": str, "license": str, "origin": str, "files": dict, "code": dict, "policy": dict}
 """The fields of ``policy.json`` beside its format, and their types."""
 
 
-def _content(folder: Path, name: str, recorded: Any, opened: Callable[[str], bytes]) -> bytes:
+class _Folder:
+    """The files of a folder, or of an archive of one."""
+
+    def __init__(self, folder: Path, archive: bytes | None) -> None:
+        self.folder = folder
+        self.content: dict[str, bytes] = {}
+        self._left = MOST_FILES
+        self._archive: dict[str, bytes] | None = None
+        if archive is not None:
+            try:
+                self._archive = dict(unzipped(archive, len(archive)))  # which is not compressed
+            except PolicyError as error:
+                raise RunError(f"the copy of {folder} is damaged: {error}") from error
+
+    def read(self, name: str, most: int = MOST_FILES) -> bytes:
+        """Return a file.
+
+        Raises:
+            RunError: it is missing or too large, or all files together are.
+        """
+        path = self.folder / name
+        if self._archive is None:
+            found = read_file(path, min(most, self._left))
+        elif name in self._archive:
+            found = self._archive[name]
+        else:
+            raise RunError(f"the copy of {self.folder} is damaged: it has no file {shown(name)}")
+        self._left -= len(found)
+        self.content[name] = found
+        return found
+
+
+def _check_code(folder: Path, listed: Mapping[str, str], given: Mapping[str, Any]) -> None:
+    """Raise a PolicyError that names listed functions which were not given."""
+    missing = [name for name in listed if name not in given]
+    if missing:
+        wanted = [f"{shown(x, 100)}: {shown_text(listed[x], 200)}" for x in missing[:MOST_SHOWN]]
+        if more := len(missing) - len(wanted):
+            wanted.append(f"and {more:,} more")
+        raise PolicyError(
+            f"{folder} needs Python code, code={{name: function}}, for {'; '.join(wanted)}"
+        )
+
+
+def _content(folder: Path, name: str, recorded: str, opened: _Folder) -> bytes:
     """Return a file of a folder, compared with its checksum."""
-    if set(name) & set("/\\\0") or not name.endswith((".onnx", ARRAYS)) or name.startswith("."):
+    plain = not set(name) & set("/\\\0") and not name.startswith(".")
+    if not plain or not name.endswith((".onnx", ARRAYS)) or len(name) > LONGEST_NAME:
         raise RunError(f"{folder / MANIFEST}: files has {shown(name)}, no file of the folder")
-    content = opened(name)
+    content = opened.read(name)
     if checksum(content) != recorded:
         raise RunError(
             f"{folder / name} has another checksum than {folder / MANIFEST} records in files: it "
@@ -388,10 +472,11 @@ def _archived(files: Mapping[str, bytes]) -> bytes:
 
 
 def _arrays(content: bytes) -> dict[str, Array]:
-    if not content:
-        return {}
+    """Return the arrays of a file ``arrays.npz`` by name."""
+    found: dict[str, Array] = {}
     try:
-        with np.load(io.BytesIO(content)) as data:
-            return dict(data)
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise PolicyError(f"{ARRAYS} is damaged: {str(error)[:200]}") from error
+        for name, data in unzipped(content, MOST_ARRAYS) if content else ():
+            found[name.removesuffix(".npy")] = numbers_in(data)
+    except PolicyError as error:
+        raise PolicyError(f"{ARRAYS} is damaged: {error}") from error
+    return found

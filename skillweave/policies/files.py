@@ -23,6 +23,11 @@ def shown(value: object, most: int = _SHOWN) -> str:
         text = repr(value)
     except Exception:  # a number of too many digits, or nested too deep
         text = f"a {type(value).__name__}"
+    return shown_text(text, most)
+
+
+def shown_text(text: str, most: int = _SHOWN) -> str:
+    """Return a text for a message, shortened."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 

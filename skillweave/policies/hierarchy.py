@@ -141,6 +141,12 @@ class CalledSkill:
     goals: Any = field(default=None, metadata={"kind": CallGoals | None})
     """``CallGoals``, or what else has their methods; None: it has none."""
 
+    def __post_init__(self) -> None:
+        for name in ("limit", "max_steps"):
+            steps = getattr(self, name)
+            if steps is not None and steps < 1:
+                raise PolicyError(f"{name} is {steps}; it must be at least 1")
+
 
 @dataclass(eq=False)
 class Critic:
@@ -579,11 +585,19 @@ class Hierarchy(Choices, Policy):
             choice = Space("Dict", parts={SKILL: plain, GOAL: of})
         if self.selector is None:
             raise PolicyError(f"{where} has no selector")
+        if self.fresh_calls and goal is None:
+            raise PolicyError(f"{where}.fresh_calls is true, but its calls have no goals")
+        if self.interruption is not None and not self.interruption.margin >= 0:
+            margin = self.interruption.margin
+            raise PolicyError(f"{where}.interruption.margin is {margin}; it must be at least 0")
+        if isinstance(self.selector, Selector):
+            self.selector.check_skills(names, choice, f"{where}.selector")
         self.selector.check(seen, choice, None, f"{where}.selector")
         if self.guide is not None:
             if not isinstance(self.guide.selector, Selector):
                 kind = type(self.guide.selector).__name__
                 raise PolicyError(f"{where}.guide is a {kind}; it must be a ready selector")
+            self.guide.selector.check_skills(names, None, f"{where}.guide")
             self.guide.selector.check(seen, plain, None, f"{where}.guide")
         if self.interruption is not None and isinstance(self.interruption.worth, Critic):
             least, most = np.asarray(-np.inf), np.asarray(np.inf)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
@@ -10,7 +11,9 @@ import numpy as np
 
 from .core import Array, LastCall, Memory, Policy, Step, Turn, World
 from .errors import PolicyError
-from .mapped import NUMBERS, open_session
+from .files import shown
+from .mapped import NUMBERS
+from .sessions import open_session
 from .spaces import Space, at
 
 
@@ -51,6 +54,15 @@ class Selector(Policy):
 
     def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
         """Notice a step of environments ``rows`` (k,), and how the last calls ended."""
+
+    def check_skills(self, names: Sequence[str], choice: Space | None, where: str) -> None:
+        """Raise a PolicyError where it chooses from other skills than a hierarchy has.
+
+        Args:
+            names: of the hierarchy's skills.
+            choice: the space of its choices; None: it guides another selector, which chooses.
+            where: begins the message.
+        """
 
     def redraws(self, greedy: bool) -> bool:
         """Return False: what it chooses follows from what it sees."""
@@ -127,6 +139,14 @@ class Network(Policy):
     """The width of its recurrent state; 0: it has none."""
     noise: tuple[Noise, ...] = ()
 
+    def __post_init__(self) -> None:
+        names = [".".join(path) for path in self.sees.leaves]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise PolicyError(
+                    f"a network sees two parts of observations as {shown(name)}: rename one"
+                )
+
     @cached_property
     def session(self) -> Any:
         """The file, opened."""
@@ -154,10 +174,12 @@ class Network(Policy):
         given |= {"mask": (np.dtype(bool), (self.choices,))} if self.choices else {}
         given |= {"memory": (single, (self.memory,))} if self.memory else {}
         given |= {f"noise.{i}": (single, (n,)) for i, (_, n) in enumerate(self.noise)}
+        tried = replace(self)
         try:
+            tried.session = open_session(self.file, "a network", trial=True)
             taken = {
                 x.name: (np.dtype(NUMBERS.get(x.type, bool)), tuple(x.shape[1:]))
-                for x in self.session.get_inputs()
+                for x in tried.session.get_inputs()
             }
             for name in given | taken:
                 if given.get(name) != taken.get(name):
@@ -166,10 +188,11 @@ class Network(Policy):
                         f"{_words(given.get(name))}"
                     )
             rows, turn = np.zeros(1, np.int64), Turn(World(np.random.default_rng(0)))
-            action = self._run(self.start(1), rows, self.sees.start(1), turn)
+            action = tried._run(self.start(1), rows, self.sees.start(1), turn)
             size = self.acts.shape if self.acts.parts is None else (self.acts.size,)
             if action.shape != (1, *size):
                 raise PolicyError(f"its file gives shape {action.shape}, not {(1, *size)}")
+            _ = self.session
         except PolicyError as error:
             raise PolicyError(f"{where}: {error}") from error
 

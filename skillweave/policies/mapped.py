@@ -13,6 +13,7 @@ import numpy as np
 
 from .core import Array, Memory, Policy, Turn, World, code, read_only
 from .errors import PolicyError
+from .sessions import open_session
 from .spaces import Space, at, discrete
 
 Shapes = Mapping[str, tuple[int | None, ...] | None]
@@ -33,8 +34,6 @@ NUMBERS: dict[str, type[np.generic]] = {
     "tensor(uint8)": np.uint8,
 }
 """Supported types of an input, by ONNX's names."""
-ELSEWHERE = b"\n\x08location\x12"
-"""The bytes of an ONNX file with which a weight names another file."""
 
 
 # Inputs -----------------------------------------------------------------------------------------
@@ -124,11 +123,18 @@ class Take:
             return found
         if self.choices:
             flat = found.reshape(len(found), -1)
-            hot = [np.eye(n)[flat[:, i] - first] for i, (n, first) in enumerate(self.choices)]
+            hot = [_one_hot(flat[:, i] - k, n) for i, (n, k) in enumerate(self.choices)]
             found = hot[0] if len(hot) == 1 else np.concatenate(hot, axis=1)
         elif found.ndim != 2:
             found = found.reshape(len(found), -1)
         return found if self._places is None else found[:, self._places]
+
+
+def _one_hot(choice: Array, count: int) -> Array:
+    """Return numbers (n, count): 1 at each choice (n,), else 0."""
+    hot = np.zeros((len(choice), count))
+    hot[np.arange(len(choice)), choice] = 1.0
+    return hot
 
 
 def numbers_of(
@@ -416,6 +422,10 @@ class Model:
         """
         raise NotImplementedError
 
+    def trial(self) -> Model:
+        """Return a copy to try what may be from others: it takes bounded time and memory."""
+        return self
+
 
 @dataclass(eq=False)
 class Function(Model):
@@ -644,6 +654,10 @@ class OnnxFile(Model):
         output = np.concatenate([one for one, _ in each])
         return output, [np.stack(x) for x in zip(*(after for _, after in each), strict=True)]
 
+    def trial(self) -> OnnxFile:
+        """Return a copy with another session."""
+        return replace(self, session=open_session(self.content, self.who, trial=True))
+
     def _run(self, rows: dict[str, Array], state: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Run the model on arrays of its own shapes."""
         outputs = [self.output]
@@ -656,27 +670,6 @@ class OnnxFile(Model):
             given = ", ".join(f"{name} {x.shape}" for name, x in rows.items())
             raise PolicyError(f"{self.who} fails on {given}: {str(error)[:500]}") from error
         return np.asarray(output), states
-
-
-def open_session(content: bytes, who: str) -> Any:
-    """Return a session of onnxruntime for an ONNX file.
-
-    Raises:
-        PolicyError: onnxruntime cannot run it, or it has weights in other files.
-    """
-    import onnxruntime
-
-    if ELSEWHERE in content:
-        raise PolicyError(
-            f"{who} has weights in other files, which no checksum covers: save it as one file"
-        )
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1  # small nets; and exact
-    options.log_severity_level = 3
-    try:
-        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's own errors have no common class
-        raise PolicyError(f"{who} cannot be run by onnxruntime: {str(error)[:300]}") from error
 
 
 # The policy -------------------------------------------------------------------------------------
@@ -790,24 +783,31 @@ class Mapped(Policy):
         own = self.goal_space
         if own is not None and (goal is None or not own.is_like(goal)):
             raise PolicyError(f"{where}.goal_space is {own}, but goals are of {goal}")
+        if isinstance(self.model, Function):
+            return
+        tried = self.model.trial()
+        aim = None if goal is None else goal.start(1)
+        turn = Turn(World(np.random.default_rng(0)), None, aim)
         functions = [take.function for take in self.takes]
-        if any([*functions, callable(self.goal), isinstance(self.model, Function)]):
+        if self.inputs is not None and (any(functions) or callable(self.goal)):
+            # Functions of the user are not asked about observations that no environment gave.
+            blank = {name: np.zeros((1, *one.shape)) for name, one in self.inputs.items()}
+            state = tuple(np.zeros((1, *shape), kind) for shape, kind in self.model.states)
+            tried.call(blank, state, turn)
             return
 
         def zeros(*given: Any) -> tuple[Any, Sequence[Array]]:
             """Return zeros for real numbers: what they are does not count, only their shape."""
-            output, after = self.model.call(*given)
+            output, after = tried.call(*given)
             output = np.asarray(output)
             return np.zeros_like(output) if output.dtype.kind == "f" else output, after
 
         model: Any = SimpleNamespace(
             expected=self.model.expected, states=self.model.states, call=zeros
         )
-        aim = None if goal is None else goal.start(1)
-        turn = Turn(World(np.random.default_rng(0)), None, aim)
         try:
-            tried = replace(self, model=model)
-            tried.act(self.start(1), np.zeros(1, np.int64), sees.start(1), turn)
+            mapped = replace(self, model=model)
+            mapped.act(self.start(1), np.zeros(1, np.int64), sees.start(1), turn)
         except PolicyError as error:
             raise PolicyError(f"{where}: {error}") from error
 

@@ -106,8 +106,11 @@ class Corrects(Around):
     def check(self, sees: Space, acts: Space, goal: Space | None, where: str) -> None:
         """Check that both fit."""
         step = self.correction.step
-        if self.correction.space.kind != "Box" or step.shape != acts.shape:
-            raise PolicyError(f"{where}: step has shape {step.shape}, but actions are of {acts}")
+        space = self.correction.space
+        if space.kind != "Box" or step.shape != acts.shape or not space.is_like(acts):
+            raise PolicyError(
+                f"{where}: step has shape {step.shape} for {space}, but actions are of {acts}"
+            )
         own = Space("Box", "float32", acts.shape, np.asarray(-1.0), np.asarray(1.0))
         self.policy.check(sees, own, goal, f"{where}.policy")
         self.base.check(sees, acts, goal, f"{where}.base")
@@ -480,6 +483,12 @@ class Remembers(Around):
         super().__post_init__()
         self.watches = True
         self.holds = False
+
+    def check(self, sees: Space, acts: Space, goal: Space | None, where: str) -> None:
+        """Check that it remembers the actions, and the policy fits."""
+        if not self.space.is_like(acts):
+            raise PolicyError(f"{where}.space is {self.space}, not {acts}")
+        self.policy.check(sees, acts, goal, f"{where}.policy")
 
     def start(self, n: int) -> Memory:
         """Return the policy's memory with a last action."""

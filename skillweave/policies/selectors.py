@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Literal
@@ -54,6 +54,7 @@ class Rule(Selector):
     def __post_init__(self) -> None:
         if not self.skills or len(set(self.skills)) < len(self.skills):
             raise PolicyError(f"{self.who} needs skills of different names, not {self.skills}")
+        self._skill_numbers = {name: i for i, name in enumerate(self.skills)}
         for name in self.goals:
             self.number(name, ": its field goals", PolicyError)
         self._choices = self._numbers = discrete(self.count)
@@ -74,12 +75,23 @@ class Rule(Selector):
         Raises:
             SkillError: no skill has this name. ``kind`` is the type of the error.
         """
-        if skill not in self.skills:
+        found = self._skill_numbers.get(skill) if isinstance(skill, str) else None
+        if found is None:
             raise kind(
                 f"{self.who}{where} names {skill!r:.100}, which is no skill of the hierarchy; its "
-                f"skills are: {', '.join(self.skills)}"
+                f"skills are: {', '.join(self.skills)[:1000]}"
             )
-        return self.skills.index(skill)
+        return found
+
+    def check_skills(self, names: Sequence[str], choice: Space | None, where: str) -> None:
+        """Check that it has the hierarchy's skills, in their order, and makes its choices."""
+        if list(self.skills) != list(names):
+            raise PolicyError(
+                f"{where}.skills are {shown(list(self.skills), 200)}, but the hierarchy has "
+                f"{shown(list(names), 200)}"
+            )
+        if choice is not None and not self._choices.is_like(choice):
+            raise PolicyError(f"{where} makes choices of {self._choices}, not of {choice}")
 
     def _chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
         choice = self.act(memory, rows, obs, Turn(World(), may))
@@ -314,6 +326,7 @@ class Automaton(Rule):
             for place, skill in enumerate(skills):
                 number = self.number(skill, f": state {state!r}", PolicyError)
                 self.ranks[i, number] = len(skills) - place
+        self._state_numbers = {name: i for i, name in enumerate(self.states)}
         self._first = self._state(self.first, "start")
         self._arrows = []
         for *pair, event in self.transitions:
@@ -332,13 +345,12 @@ class Automaton(Rule):
 
     def _state(self, name: str, where: str) -> int:
         """Return the number of a state; ``where`` it is named, for messages."""
-        names = list(self.states)
-        if name not in names:
+        if name not in self._state_numbers:
             raise PolicyError(
                 f"{self.who}: {where} names the state {shown(name, 100)}, which does not exist; "
-                f"the states are: {', '.join(names)[:300]}"
+                f"the states are: {', '.join(self.states)[:300]}"
             )
-        return names.index(name)
+        return self._state_numbers[name]
 
     def start(self, n: int) -> Memory:
         """Return the memory of n environments in the first state."""

@@ -6,6 +6,7 @@ They are Gymnasium's, without Gymnasium.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from .infos import NUMBERS
 Kind = Literal["Box", "Discrete", "MultiDiscrete", "MultiBinary", "Dict", "Tuple"]
 MOST = 10**8
 """The most numbers of one space: a damaged shape must not take all memory."""
+DTYPE = re.compile("[<>=|]?(bool|u?int|float|longdouble|[biuf])[0-9]*")
+"""NumPy's names of types of numbers."""
 MOST_CHOICES, MOST_OF_ALL = 256, 10_000
 """The most values of a whole number of a Box, and of all its numbers, that are choices: each is an
 output of a network."""
@@ -50,14 +53,21 @@ class Space:
     def __post_init__(self) -> None:
         if self.parts is not None or self.kind in ("Dict", "Tuple"):
             if not self.parts or self.kind not in ("Dict", "Tuple"):
-                raise PolicyError(f"a space is a {self.kind} of the parts {list(self.parts or ())}")
+                names = shown(list(self.parts or ()))
+                raise PolicyError(f"a space is a {self.kind} of the parts {names}")
             return
         if any(n < 0 for n in self.shape) or np.prod(self.shape, dtype=float) > MOST:
-            raise PolicyError(f"a space has the shape {self.shape}, but at most {MOST:,} numbers")
+            raise PolicyError(
+                f"a space has the shape {shown(self.shape)}, but at most {MOST:,} numbers"
+            )
         try:
+            if not DTYPE.fullmatch(self.dtype):
+                raise TypeError
             kind = np.dtype(self.dtype).kind
             low, high = (np.broadcast_to(x, self.shape) for x in (self.low, self.high))  # type: ignore[arg-type]
             fits = kind in "biuf" and bool((low <= high).all())
+            fits &= self.kind == "Box" or kind in "iu"
+            fits &= self.kind != "Discrete" or self.shape == ()
         except (TypeError, ValueError):
             fits = False
         if not fits:
@@ -106,6 +116,8 @@ class Space:
         if self.parts is not None:
             return [n for part in self.parts.values() for n in part.counts]
         if np.dtype(self.dtype).kind == "f":
+            return []
+        if self.kind == "Box" and math.prod(self.shape) > MOST_OF_ALL:
             return []
         low, high = (np.asarray(x).astype(object) for x in self.bounds)
         counts: list[int] = np.broadcast_to(high - low + 1, self.shape).reshape(-1).tolist()

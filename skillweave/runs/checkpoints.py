@@ -62,7 +62,7 @@ class Checkpoints:
             if not os.path.lexists(path):
                 continue
             try:
-                tensors, header = read_tensors(path)
+                tensors, header = read_tensors(path, most=None)
                 if header.get("stage") != stage:
                     continue
                 checkpoint: Checkpoint = record_in(Checkpoint, header, path)
@@ -121,5 +121,5 @@ class Checkpoints:
         for path in self._files:
             with suppress(RunError):  # a damaged one raises when it is needed
                 if path.exists() and read_header(path).get("stage") in done:
-                    read_tensors(path)  # a header alone may be damaged
+                    read_tensors(path, most=None)  # a header alone may be damaged
                     remove(path)

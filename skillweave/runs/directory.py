@@ -349,7 +349,7 @@ class RunDirectory:
         path = self.file(FINAL, stage)
         if not path.exists():
             return None
-        tensors, found = read_tensors(path)
+        tensors, found = read_tensors(path, most=None)
         header: Checkpoint = record_in(Checkpoint, found, path)
         if header.stage != stage:
             raise RunError(f"{path} holds the state of stage {shown(header.stage)}")
@@ -433,7 +433,7 @@ class RunDirectory:
         path = self.file("states", name)
         if not path.exists():
             return None
-        tensors, header = read_tensors(path)
+        tensors, header = read_tensors(path, most=None)
         if header.get("learns") != name:
             raise RunError(f"{path} does not hold the state of {name!r}")
         self.must_be_ours(header.get("run"), path)

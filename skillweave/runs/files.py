@@ -30,7 +30,9 @@ TEMPORARY = ".*.tmp"
 """Names of files while they are written; only a killed process leaves some behind."""
 _BINARY = getattr(os, "O_BINARY", 0)  # of Windows
 LARGEST_JSON = 16 * 2**20
-"""The most bytes of a JSON file."""
+"""The most bytes of a JSON file, or of a line of one."""
+LARGEST_WEIGHTS = 2**31
+"""The most bytes of a file with a policy; checkpoints also hold replay buffers, of any size."""
 
 
 def write_bytes(
@@ -217,13 +219,19 @@ def record_in(kind: Any, header: Mapping[str, Any], path: Path | str) -> Any:
     return fit(kind, {k: v for k, v in header.items() if k not in ("schema", "sha256")}, str(path))
 
 
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_tensors(
+    path: Path, most: int | None = LARGEST_WEIGHTS
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Return tensors and header, with its checksum ``sha256``, written by ``write_tensors``.
 
+    Args:
+        most: the most bytes of the file, which are all read; None: any number.
+
     Raises:
-        RunError: missing, truncated, altered, no plain file, not Skillweave's, or of a
+        RunError: missing, truncated, altered, no plain file, too large, not Skillweave's, or of a
             newer schema.
     """
+    check_file(path, most)
     header, tensors = _open(path, with_tensors=True)
     if header.get("sha256") != _digest(path, header, tensors):
         raise RunError(f"{path} is damaged: its contents do not match its checksum")

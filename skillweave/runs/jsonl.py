@@ -11,7 +11,7 @@ from typing import Any
 
 from skillweave.errors import RunError
 from skillweave.policies.files import check_file, load_json, shown
-from skillweave.runs.files import own_copy
+from skillweave.runs.files import LARGEST_JSON, own_copy
 from skillweave.schema import as_json, fit
 
 
@@ -79,7 +79,13 @@ class JsonLines:
             return
         check_file(self.path)
         with self.path.open("rb") as file:
-            for number, line in enumerate(file, 1):
+            lines = iter(lambda: file.readline(LARGEST_JSON + 1), b"")
+            for number, line in enumerate(lines, 1):
+                if len(line) > LARGEST_JSON:
+                    raise RunError(
+                        f"{self.path} is damaged in line {number}: it has more than "
+                        f"{LARGEST_JSON:,} bytes"
+                    )
                 if not line.endswith(b"\n"):
                     return
                 try:

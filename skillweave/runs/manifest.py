@@ -14,14 +14,14 @@ from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
 
-from skillweave._internal.paths import names_in
+from skillweave._internal.paths import level_of, names_in
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentHeader
 from skillweave.errors import EnvError, RunError
 from skillweave.policies.files import shown
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.files import read_json, record_in
-from skillweave.schema import AtLeastOne, Check, Count, NonNegative, Positive, as_json
+from skillweave.schema import AtLeastOne, Check, Count, NonNegative, Positive, Threads, as_json
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
 
@@ -238,7 +238,10 @@ class StageEntry:
     decides: NodePath | None
     """The policy that chooses among the skills; None: one policy acts all the time."""
     budget: AtLeastOne
-    algorithm: dict[str, Any]
+    algorithm: Annotated[
+        dict[str, Any],
+        Check('the settings of an algorithm, among them "num_envs"', lambda x: "num_envs" in x),
+    ]
     target: Target | None
     """A target at which it ends early; None: without target."""
     status: Literal["waiting", "training", "done"]
@@ -254,9 +257,15 @@ class StageEntry:
     """Keep the jointly learnt weights only if they are better than the earlier ones."""
     greedy_judged: bool | None = None
     """At its end, evaluate whether skills and selector should act greedily or sample."""
-    evolution: dict[str, Any] | None = None
+    evolution: (
+        Annotated[
+            dict[str, Any],
+            Check('the settings of a population, with "population"', lambda x: "population" in x),
+        ]
+        | None
+    ) = None
     """Settings of its population."""
-    workers: AtLeastOne = 1
+    workers: Threads = 1
     """Processes for its environments; parts of its population."""
     starts: dict[NodePath, Start] = field(default_factory=dict)
     """Initial policies from other runs, by learner."""
@@ -501,6 +510,10 @@ def manifest_in(data: Mapping[str, Any], file: str = "") -> Manifest:
         for i, name in enumerate(names):
             if name in names[:i]:
                 raise RunError(f"{file}: {kind}[{i}].name is {shown(name)}, a second time")
+    for path in manifest.levels:
+        if not any(level_of(name) == path for name in manifest.by_path):
+            of = f"of the hierarchy {path!r}" if path else "at all"
+            raise RunError(": ".join(filter(None, [file, f"skills has no skill {of}"])))
     if manifest.hierarchy is None and len(manifest.stages) != 1:
         raise RunError(
             f"{file}: stages has {len(manifest.stages)} entries, but a plain agent has one"
@@ -508,6 +521,8 @@ def manifest_in(data: Mapping[str, Any], file: str = "") -> Manifest:
     for i, stage in enumerate(manifest.stages):
         where = f"stages[{i}]"
         config_from_json(stage.algorithm, file, f"{where}.algorithm")
+        for name, algorithm in stage.algorithms.items():
+            config_from_json(algorithm, file, f"{where}.algorithms[{name!r}]")
         if stage.done and None in (stage.steps, stage.seconds):
             raise RunError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
     return manifest

@@ -18,7 +18,8 @@ from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, RunError, needs_extra
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.files import check_file
-from skillweave.policies.mapped import OnnxFile, fits_shape, open_session
+from skillweave.policies.mapped import OnnxFile, fits_shape
+from skillweave.policies.sessions import open_session
 from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import SEES
 from skillweave.skills.mapped import MappedPolicy

@@ -28,6 +28,7 @@ from skillweave.ops.device import resolve_device
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.initial_policies import initial_policy
 from skillweave.runs.manifest import StageEntry
+from skillweave.schema import fit
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.joint import JointLearner
 from skillweave.training.keep_best import KeepBest
@@ -62,7 +63,10 @@ class Agents:
         first = entry.decides or entry.learns[0]
         self.level = level_of(first)
         self.roles = self.task.roles or {first: self.task.role}
-        self.together = None if entry.together is None else Together(**entry.together)
+        file, place = str(stage.run.path / "run.json"), f"{entry.name}: together"
+        self.together = (
+            None if entry.together is None else fit(Together, entry.together, file, place)
+        )
         self._resources = ExitStack()
         self._make_collectors = make_collectors
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -20,12 +20,21 @@ from skillweave.planning.columns import (
 from skillweave.planning.handover import Handover, pair_counts
 from skillweave.planning.recorder import Recorder
 from skillweave.policies.core import CallEnd
-from skillweave.schema import Count
+from skillweave.schema import Check, Count
 from skillweave.skills import is_trained
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.learnable import learn_on
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.types import Array
+
+Ended = Annotated[
+    dict[str, Count],
+    Check(
+        f"numbers of calls by {', '.join(ENDS.values())}, or empty",
+        lambda x: not x or set(x) == set(ENDS.values()),
+    ),
+]
+"""Numbers of calls by their end; empty: unknown."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +51,7 @@ class SkillReport:
     """Environment steps of the skill."""
     calls: Count
     """Number of calls."""
-    ended: dict[str, Count]
+    ended: Ended
     """Calls by their end: ``own``, ``limit``, ``interrupted``, ``episode`` (the episode ended, or
     the evaluation's step limit cut it). They add up to ``calls``; empty: unknown."""
     succeeded: Count | None

@@ -381,7 +381,7 @@ class Session:
 
     known: list[tuple[Any, bool]] = []  # noqa: RUF012
 
-    def __init__(self, content: bytes, who: str) -> None:
+    def __init__(self, content: bytes, who: str, trial: bool = False) -> None:
         self.net, self.sampled = self.known[int(content)]
 
     @classmethod

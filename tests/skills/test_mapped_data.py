@@ -128,7 +128,7 @@ def test_an_onnx_file_that_its_fields_do_not_fit_is_refused(content):
     with pytest.raises(PolicyError, match="cannot be run by onnxruntime"):
         OnnxFile(b"junk", **right)
     with pytest.raises(PolicyError, match="has weights in other files"):
-        OnnxFile(content + b"\n\x08location\x12\x01x", **right)
+        OnnxFile(content + b"\x3a\x04\x2a\x02\x6a\x00", **right)  # a weight's external_data
     four = Input((Take("observation", (4,)),), (4,))
     with pytest.raises(PolicyError, match=r"Mapped.inputs has .*but the model takes"):
         Mapped(file, Outputs(box(2)), {"": four})
