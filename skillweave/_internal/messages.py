@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -140,7 +141,18 @@ def shown_path(path: Path) -> Path:
 
 
 def as_path(path: str | Path, name: str) -> Path:
-    """Return ``path`` as a ``Path``; an error names the argument where it is none."""
+    """Return ``path`` as a ``Path``; an error names the argument where it cannot be one.
+
+    Raises:
+        DeclarationError: it is no path.
+        RunError: the system cannot look there, because a name is too long, for example.
+    """
     if not isinstance(path, str | Path) or "\0" in str(path) or len(str(path)) > 4_096:
         raise DeclarationError(f"{name} is {short(path)}; it must be a path")
+    try:
+        os.stat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        raise RunError(f"{name} is {short(str(path))}: {error.strerror}") from error
     return Path(path)

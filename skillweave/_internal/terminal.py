@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from skillweave.policies.errors import printable as printable
+from skillweave.policies.errors import RunError, printable as printable
 
 STANDARD = (0, 1, 2)
 """Numbers of the standard streams."""
@@ -39,28 +39,28 @@ def put_result(text: str = "") -> None:
     """Write a line to standard output; ignore a reader that has closed it.
 
     Raises:
-        OSError: it cannot be written, for example because the disk is full.
+        RunError: it cannot be written, for example because the disk is full.
     """
-    stream = sys.stdout
+    put_line(text, sys.stdout)
+
+
+def put_line(text: str, stream: Any) -> None:
+    """Write a line to a stream, or nowhere if it is None; otherwise as ``put_result``."""
     if stream is None or stream.closed:
         return
     try:
         print(_encodable(printable(text), stream), file=stream, flush=True)
     except BrokenPipeError:
         _discard(stream)
-    except OSError:
+    except OSError as error:
         _discard(stream)
-        raise
+        raise RunError(f"could not write to standard output: {error.strerror}") from error
 
 
 def end_quietly() -> None:
     """Discard the buffers of closed or full streams, so that Python ends without a message."""
     for stream in (sys.stdout, sys.stderr):
-        try:
-            if stream is not None:
-                stream.flush()
-        except (OSError, ValueError):
-            _discard(stream)
+        _flush(stream)
 
 
 @contextmanager
@@ -84,6 +84,62 @@ def steady_streams() -> Iterator[None]:
         finally:
             if sys.stderr is nowhere:
                 sys.stderr = closed
+
+
+@contextmanager
+def reserved_stdout(*, lasting: bool) -> Iterator[Any]:
+    """Yield standard output as it was; all else that is written there goes to standard error.
+
+    That is what environments, libraries, C code and other processes print within the block.
+
+    Args:
+        lasting: until this process ends, since C code may write its buffers only then.
+    """
+    outer = sys.stdout
+    _flush(outer)
+    number = os.dup(1)
+    os.dup2(2, 1)
+    sys.stdout = sys.stderr
+    result = outer
+    if _number(outer) == 1:
+        result = os.fdopen(os.dup(number), "w", encoding=outer.encoding, errors=outer.errors)
+    try:
+        yield result
+    finally:
+        _flush(outer)
+        if result is not outer:
+            _flush(result)
+            result.close()
+        if not lasting:
+            sys.stdout = outer
+            _flush_c()
+            os.dup2(number, 1)
+        os.close(number)
+
+
+def _flush(stream: Any) -> None:
+    """Write what waits in a stream; discard it if that is not possible."""
+    try:
+        if stream is not None:
+            stream.flush()
+    except (OSError, ValueError):
+        _discard(stream)
+
+
+def _flush_c() -> None:
+    """Write what waits in the streams of C code."""
+    with suppress(Exception):  # not every system has this function
+        import ctypes
+
+        ctypes.CDLL(None).fflush(None)
+
+
+def _number(stream: Any) -> int | None:
+    """Return the number of the file to which a stream writes; None: it has none."""
+    try:
+        return int(stream.fileno())
+    except Exception:  # a stream of the user's own may be anything
+        return None
 
 
 def _encodable(text: str, stream: Any) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
@@ -13,15 +14,21 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
-from skillweave._internal.messages import error_text, suggest
+import gymnasium as gym
+
+from skillweave._internal.messages import as_path, error_text, suggest
 from skillweave._internal.shipped import FOLDER, file_of, names
 from skillweave._internal.tracebacks import place
 from skillweave.api.running import READING
 from skillweave.errors import DeclarationError, SkillweaveError, reworded
 from skillweave.hierarchy.declaration import Declaration
+from skillweave.runs.command_words import python_string
 from skillweave.workers.shipping import add_folder
 
 H = TypeVar("H", bound=Declaration)
+
+ENV_ID = re.compile(r"([\w:.-]+/)?[\w:.-]+-v\d+")
+"""The form of an environment's id in Gymnasium."""
 
 
 def hierarchy_in(recipe: str, kind: type[H]) -> H:
@@ -35,11 +42,11 @@ def hierarchy_in(recipe: str, kind: type[H]) -> H:
         DeclarationError: no such recipe (with a similar one) or file, no hierarchy in it, the file
             trains as soon as it is read, or it raises an error.
     """
-    path = file_of(recipe)
+    path = as_path(file_of(recipe), "recipe")
     if path.suffix == ".py" and path.is_file():
         module = read_recipe_file(path, recipe, shipped=path.parent == FOLDER)
     else:
-        raise DeclarationError(f"no recipe or Python file {recipe!r}{suggest(recipe, names())}")
+        raise DeclarationError(_no_recipe(recipe))
     declared = {k: v for k, v in vars(module).items() if isinstance(v, kind)}
     if "hierarchy" not in declared and len(declared) != 1:
         raise DeclarationError(
@@ -50,6 +57,31 @@ def hierarchy_in(recipe: str, kind: type[H]) -> H:
     hierarchy.recipe = recipe
     declaration: H = hierarchy
     return declaration
+
+
+def _no_recipe(name: str) -> str:
+    """Return a sentence on a name that is no recipe and no file."""
+    if is_env_id(name):
+        return (
+            f"{name!r} is an environment, and no recipe: declare skills for it in a Python file of "
+            "three lines, 'import skillweave as sw', 'class Move(sw.Skill): max_steps = 20', "
+            f"'hierarchy = sw.Hierarchy({python_string(name)}, [Move()], steps=100_000)', and give "
+            "that file; or train one agent in Python: "
+            f"sw.train_agent({python_string(name)}, sw.PPO(), 100_000)"
+        )
+    if name.endswith(".py"):
+        return f"the file {name!r} does not exist"
+    if name.endswith((".yaml", ".yml", ".json", ".toml", ".ini")):
+        return (
+            f"{name!r} is no recipe: a Python file declares the hierarchy, and --set NAME=VALUE "
+            "changes its settings"
+        )
+    return f"no recipe or Python file {name!r}{suggest(name, names())}"
+
+
+def is_env_id(name: str) -> bool:
+    """Return whether a name is the id of an environment in Gymnasium, or has its form."""
+    return name in gym.registry or ENV_ID.fullmatch(name) is not None
 
 
 def read_recipe_file(path: Path, recipe: str, *, shipped: bool = False) -> ModuleType:

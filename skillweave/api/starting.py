@@ -165,7 +165,7 @@ def _use_of(value: Any) -> tuple[str, str] | None:
         )
 
     if isinstance(value, str | Path) and "\0" not in str(value):
-        path = Path(value)
+        path = as_path(value, "start_from")
         if path.is_dir():
             return None
         # Stable-Baselines3 adds the ending where it saves and loads.

@@ -14,9 +14,10 @@ from typing import Any
 
 from skillweave import recipes
 from skillweave._internal.messages import shown_path
+from skillweave._internal.terminal import put_result
 from skillweave.api import Hierarchy, Run
 from skillweave.cli import commands
-from skillweave.cli.output import Result, print_line, save_score
+from skillweave.cli.output import Result, save_score
 from skillweave.errors import MissingExtra, RunError
 from skillweave.recipes import lander_missions as missions
 from skillweave.training.evaluation import Evaluation
@@ -52,7 +53,7 @@ class Demo:
     def say(self, text: str = "") -> None:
         """Print a line at once, since the next one may take a minute."""
         if not self.command.json:
-            print_line(text)
+            put_result(text)
 
     def lander(self) -> None:
         """Learn LunarLander with the tutorial's three skills."""

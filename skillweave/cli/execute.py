@@ -6,20 +6,22 @@ import ast
 import importlib
 import json
 from collections.abc import Callable, Iterable
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from skillweave import recipes
+from skillweave._internal.messages import as_path
 from skillweave._internal.notices import notice
 from skillweave._internal.terminal import one_line, say
 from skillweave.api import Agent, Hierarchy, Run, info_json
 from skillweave.api.hub import pull_run, push_run
 from skillweave.api.loading import declared_in, load_from
 from skillweave.api.planning import lacking_features, mission_words
+from skillweave.api.recipe_file import is_env_id
 from skillweave.cli import commands
 from skillweave.cli.demo import demo
-from skillweave.cli.output import Result, print_line, run_words, save_score
+from skillweave.cli.output import Result, run_words, save_score
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.sweep import sweep
 from skillweave.cli.training import resume, train
@@ -39,14 +41,14 @@ from skillweave.runs.several import open_runs
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluations
 
 
-def run(command: commands.Output) -> int:
-    """Carry a command out and print its result; return the exit code."""
-    result, text = WAYS[type(command)](command)
-    if command.json:  # without any character that a terminal obeys
-        print_line(json.dumps(result, default=str).replace("\x7f", "\\u007f"))
-    elif text is not None:
-        print_line(text)
-    return 1 if result.get("failed") else 0  # runs of a sweep
+def run(command: commands.Output) -> Result:
+    """Carry a command out, and return its result."""
+    for field in fields(command):
+        value = getattr(command, field.name)
+        for word in value if isinstance(value, tuple) else (value,):
+            if isinstance(word, Path) or (word and field.name in ("recipe", "target")):
+                as_path(word, field.name)
+    return WAYS[type(command)](command)
 
 
 def _evaluate(command: commands.Evaluate) -> Result:
@@ -391,9 +393,11 @@ def _load_target(command: commands.Watched | commands.Export | commands.Plan) ->
         elif header.env is not None:
             return Agent.from_weights(path)
         return declared_in(command.recipe or named, command.recipe, str(path)).load_weights(path)
-    hint = (
-        " (add --pretrained for its shipped weights)" if command.target in recipes.names() else ""
-    )
+    hint = ""
+    if command.target in recipes.names():
+        hint = " (add --pretrained for its shipped weights)"
+    elif is_env_id(command.target):
+        hint = ", but an environment: train a hierarchy on it first (skillweave train FILE.py)"
     raise RunError(f"{command.target} is neither a run nor a weights file{hint}")
 
 

@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import re
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
-from skillweave._internal.terminal import end_quietly, put_result, say, steady_streams
+from skillweave._internal.terminal import (
+    end_quietly,
+    put_line,
+    put_result,
+    reserved_stdout,
+    say,
+    steady_streams,
+)
+from skillweave.policies.errors import RunError
 
+Put = Callable[[str], None]
+"""A function that writes a command's result."""
 ADDRESS = re.compile(r"auto|local|(ray://)?[^\s/-][^\s/]*:\S*")
 """What may follow ``--ray``."""
 
@@ -21,63 +35,112 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     A reader that went away (``| head``) is no error.
     """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    alone = arguments is None  # this process is for the command
     try:
         with steady_streams():
-            return _main(arguments)
+            if "--json" not in words or {"-h", "--help"} & set(words):
+                return _main(words, put_result, alone)
+            with reserved_stdout(lasting=alone) as stream:
+                return _with_json(words, stream, alone)
     except BrokenPipeError:
         return 0
     finally:
         end_quietly()
 
 
-def _main(arguments: Sequence[str] | None) -> int:
-    words = sys.argv[1:] if arguments is None else arguments
+def _with_json(words: Sequence[str], stream: Any, alone: bool) -> int:
+    """Run one command, and write one JSON object to ``stream``, however the command ends."""
+    answered = False
+
+    def put(text: str) -> None:
+        nonlocal answered
+        answered = True
+        put_line(text, stream)
+
+    try:
+        return _main(words, put, alone)
+    except BaseException as error:
+        if not answered:
+            wrong = isinstance(error, SystemExit)
+            message = "the arguments are wrong; standard error says how" if wrong else repr(error)
+            with suppress(RunError):  # the error itself goes on
+                put(as_json({"error": message}))
+        raise
+
+
+def _main(words: Sequence[str], put: Put, alone: bool) -> int:
     if list(words) == ["--version"]:
         from skillweave import __version__
 
-        put_result(f"skillweave {__version__}")
+        put(f"skillweave {__version__}")
         return 0
-    import tyro
-
-    from skillweave.cli import commands
-
-    tyro_arguments = ["--no-deterministic" if word == "--stochastic" else word for word in words]
-    tyro_arguments = _with_addresses(tyro_arguments)
-    parser: dict[str, Any] = {commands.name_of(c): c for c in commands.COMMANDS}
-    if wrong := _unknown_command(words, list(parser)):
-        say(f"error: {wrong}")
-        return 2
-    command: Any = tyro.extras.subcommand_cli_from_dict(
-        parser,
-        prog="skillweave",
-        description="Teach agents skills and weave them into one policy. "
-        "skillweave --version prints the version.",
-        args=tyro_arguments,
-    )
-    from skillweave._internal.tracebacks import all_frames_wanted
-    from skillweave.errors import SkillweaveError
-    from skillweave.runs.command_words import called_by
-
+    command: Any = None
     try:
-        from skillweave.cli import execute
+        with _short_interrupts(words, put) if alone else nullcontext():
+            import tyro
 
+            from skillweave._internal.tracebacks import all_frames_wanted
+            from skillweave.cli import commands
+            from skillweave.cli.elsewhere import foreign_words
+            from skillweave.errors import SkillweaveError
+            from skillweave.runs.command_words import called_by
+
+            parser: dict[str, Any] = {commands.name_of(c): c for c in commands.COMMANDS}
+            if wrong := foreign_words(words, parser):
+                return _fail(words, put, wrong, 2)
+            command = tyro.extras.subcommand_cli_from_dict(
+                parser,
+                prog="skillweave",
+                description="Teach agents skills and weave them into one policy. "
+                "skillweave --version prints the version.",
+                args=_for_tyro(words),
+            )
+            from skillweave.cli import execute
+    except KeyboardInterrupt:
+        return _fail(words, put, "interrupted", 130)
+    try:
         with called_by("command line"):
-            return execute.run(command)
+            result, text = execute.run(command)
+            if command.json:
+                put(as_json(result))
+            elif text is not None:
+                put(text)
+        return 1 if result.get("failed") else 0  # runs of a sweep
     except SkillweaveError as error:
         if command.traceback or all_frames_wanted():
             say("".join(traceback.format_exception(error)).rstrip())
-        return _fail(command, str(error), 1)
+        return _fail(words, put, str(error), 1)
     except KeyboardInterrupt as error:
-        return _fail(command, str(error) or "interrupted", 130)
+        return _fail(words, put, str(error) or "interrupted", 130)
 
 
-def _unknown_command(words: Sequence[str], known: Sequence[str]) -> str:
-    """Return a sentence about a first word that is no command; empty if it is one, or none."""
-    if not words or words[0] in known or words[0].startswith("-"):
-        return ""
-    from skillweave._internal.messages import suggest
+@contextmanager
+def _short_interrupts(words: Sequence[str], put: Put) -> Iterator[None]:
+    """End the process at Ctrl-C within the block, in which large libraries are imported.
 
-    return f"no command {words[0]!r}{suggest(words[0], known)} (skillweave --help)"
+    An exception in the middle of an import may be lost, or become another one.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+
+    def end(*_: Any) -> None:
+        try:
+            _fail(words, put, "interrupted", 130)
+        finally:
+            os._exit(130)
+
+    signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _for_tyro(words: Sequence[str]) -> list[str]:
+    return _with_addresses(["--no-deterministic" if w == "--stochastic" else w for w in words])
 
 
 def _with_addresses(words: Sequence[str]) -> list[str]:
@@ -90,10 +153,28 @@ def _with_addresses(words: Sequence[str]) -> list[str]:
     return [*complete, ""] if complete[-1:] == ["--ray"] else complete
 
 
-def _fail(command: Any, message: str, code: int) -> int:
-    if command.json:
-        with suppress(OSError):  # it is printed below as well
-            put_result(json.dumps({"error": message}))
+def _fail(words: Sequence[str], put: Put, message: str, code: int) -> int:
+    if "--json" in words:
+        with suppress(RunError):  # it is printed below as well
+            put(as_json({"error": message}))
     kind = "stopped" if code == 130 else "error"
     say(f"{kind}: {message}")
     return code
+
+
+def as_json(result: dict[str, Any]) -> str:
+    """Return a result as JSON, without any character that a terminal obeys; NaN becomes null."""
+    try:
+        text = json.dumps(result, default=str, allow_nan=False)
+    except ValueError:
+        text = json.dumps(_finite(json.loads(json.dumps(result, default=str))))
+    return text.replace("\x7f", "\\u007f")
+
+
+def _finite(data: Any) -> Any:
+    """Return data of JSON in which numbers that JSON lacks (NaN, infinity) are None."""
+    if isinstance(data, dict):
+        return {key: _finite(value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [_finite(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data

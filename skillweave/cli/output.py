@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from skillweave._internal.messages import shown_path
-from skillweave._internal.terminal import put_result, say
+from skillweave._internal.terminal import say
 from skillweave.api import Run
 from skillweave.errors import RunError
 from skillweave.runs.command_words import command_words
@@ -15,18 +15,6 @@ from skillweave.training.evaluation_file import save_evaluation
 
 Result = tuple[dict[str, Any], str | None]
 """The result of a command for programs, and for people; None: they have seen it."""
-
-
-def print_line(text: str = "") -> None:
-    """Print a line of results.
-
-    Raises:
-        RunError: standard output cannot be written.
-    """
-    try:
-        put_result(text)
-    except OSError as error:
-        raise RunError(f"could not write to standard output: {error.strerror}") from error
 
 
 def save_score(trained: Run, score: Evaluation, seed: int = 0, deterministic: bool = True) -> None:

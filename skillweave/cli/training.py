@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
@@ -10,10 +11,11 @@ from typing import Any
 
 from skillweave import recipes
 from skillweave._internal.messages import shown_path
+from skillweave._internal.terminal import put_result
 from skillweave.api import Hierarchy, Run
 from skillweave.api.loading import declared_by
 from skillweave.cli import commands
-from skillweave.cli.output import Result, print_line, run_words, save_score
+from skillweave.cli.output import Result, run_words, save_score
 from skillweave.cli.overrides import apply_overrides, parse_evolve
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.config import Evolution
@@ -50,7 +52,7 @@ def train(command: commands.Train) -> Result:
     result, lines = _summary(command, trained, command.render)
     if command.versus_flat:
         if not command.json:  # now: the flat agent takes as long again
-            print_line("\n".join(lines))
+            put_result("\n".join(lines))
         flat = _trained(command, hierarchy, True, flat_out, baseline=True)
         result["flat"], more = _summary(command, flat)
         verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])
@@ -106,7 +108,7 @@ def _start_from(words: Sequence[str]) -> str | dict[str, str] | None:
     """
     if not words:
         return None
-    if len(words) == 1 and ("=" not in words[0] or Path(words[0]).exists()):
+    if len(words) == 1 and ("=" not in words[0] or os.path.exists(words[0])):
         return words[0]
     run_of: dict[str, str] = {}
     for word in words:

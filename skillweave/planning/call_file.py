@@ -27,6 +27,7 @@ from skillweave.runs.user_code import Texts
 from skillweave.schema import AtLeastOne, Count
 from skillweave.skills.base import NAME
 from skillweave.spaces import (
+    leaves,
     obs_codec,
     obs_dtype,
     obs_shape,
@@ -199,7 +200,7 @@ def _column(
         raise ValueError(f"{name!r} is {x.dtype} {x.shape}")
     if fields:
         x = x.view(dtype).reshape(shape[0])
-    for numbers in [x[part] for part in fields] if fields else [x]:
+    for numbers in leaves(x):
         if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():
             raise ValueError(f"{name!r} is not finite")
         if numbers.size and not (low <= numbers.min() and numbers.max() <= high):

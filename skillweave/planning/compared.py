@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from skillweave.planning.columns import CallColumns
 from skillweave.planning.lacking import read_log
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbors import FeatureMap, Standard, evenly, nearest
-from skillweave.spaces import obs_codec
+from skillweave.spaces import leaves, obs_codec
 from skillweave.types import Array
 
 MOST_STEPS = 0.5
@@ -176,11 +176,3 @@ def _reads_fixed(task: RewardMachine, log: CallColumns) -> bool:
         np.array_equal(known.events, changed.events)
         and np.array_equal(known.values, changed.values)
     )
-
-
-def leaves(obs: Array) -> Iterator[Array]:
-    """Yield the innermost parts of observations (n, …), which share their memory."""
-    for name in obs.dtype.names or ():
-        yield from leaves(obs[name])
-    if obs.dtype.names is None:
-        yield obs

@@ -8,7 +8,6 @@ import numpy as np
 
 from skillweave.errors import RunError
 from skillweave.planning.calls import CallLog
-from skillweave.planning.compared import leaves
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.handover import wilson
 from skillweave.planning.lacking import names_of, read_log
@@ -16,6 +15,7 @@ from skillweave.planning.machine import RewardMachine, predicates_of
 from skillweave.planning.planner import Planner
 from skillweave.policies.plan import Readings
 from skillweave.policies.planned import SLACK
+from skillweave.spaces import leaves
 from skillweave.types import Array
 
 EPISODES = 200

@@ -17,6 +17,7 @@ from skillweave.reporting.report.curves import read_curves
 from skillweave.reporting.report.facts import is_binary
 from skillweave.reporting.report.groups import grouped, on_one_grid
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import written
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.several import open_runs
 from skillweave.schema import Check, fitted
@@ -273,12 +274,10 @@ def _draw(
 def _save(figure: Any, out: Path) -> tuple[Path, ...]:
     stem = out.with_suffix("") if out.suffix in (".png", ".svg") else out
     paths = tuple(stem.parent / f"{stem.name}{suffix}" for suffix in (".png", ".svg"))
-    try:
+    with written(stem):
         stem.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(paths[0], dpi=DPI)
         figure.savefig(paths[1], metadata={"Date": None})
-    except OSError as error:
-        raise RunError(f"could not write {stem}: {error.strerror}") from error
     return paths
 
 

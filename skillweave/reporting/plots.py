@@ -17,6 +17,7 @@ from skillweave.reporting.lineage import (
 )
 from skillweave.reporting.palette import color_of, hex_of
 from skillweave.runs.directory import RunDirectory, file_name
+from skillweave.runs.files import written
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.manifest import LineageLine
 
@@ -41,7 +42,7 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
     with needs_extra("plotting", "plot"):
         from matplotlib.figure import Figure
     folder = out or run.path / "plots"
-    written = []
+    paths = []
     must_be_own(folder)
     metrics = list(run.metrics())
     for i, stage in enumerate(run.manifest.stages):
@@ -61,15 +62,17 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
             axes.plot(*curve, color=color, linewidth=1.8)
             axes.set_title(f"{name}: return while training", loc="left", fontsize=12)
             _plain(axes, "mean return of 100 episodes", "environment steps")
-        folder.mkdir(parents=True, exist_ok=True)
         for suffix in (".png", ".svg"):
-            written.append(folder / f"{file_name(name)}{suffix}")
-            figure.savefig(written[-1], dpi=120)
-    if not written:
+            path = folder / f"{file_name(name)}{suffix}"
+            with written(path):
+                folder.mkdir(parents=True, exist_ok=True)
+                figure.savefig(path, dpi=120)
+            paths.append(path)
+    if not paths:
         lines = run.path / "metrics.jsonl"
         why = "no episode has ended" if lines.exists() else f"there is no {lines}"
         raise RunError(f"{run.path} holds nothing to draw: {why}")
-    return written
+    return paths
 
 
 def _draw_lineage(make: Any, lineage: Lineage, name: str, color: str) -> Any:

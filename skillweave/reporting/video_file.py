@@ -6,6 +6,7 @@ import importlib
 import os
 import struct
 import subprocess
+from contextlib import suppress
 from pathlib import Path
 from subprocess import PIPE
 from typing import Any, Self
@@ -14,6 +15,7 @@ import numpy as np
 
 from skillweave.errors import DeclarationError, EnvError, RunError, needs_extra
 from skillweave.reporting.palette import OWN_COLORS
+from skillweave.runs.files import written
 from skillweave.types import Array
 
 
@@ -39,13 +41,14 @@ class VideoWriter:
         suffix = self.path.suffix.lower()
         if suffix not in (".gif", ".mp4"):
             raise DeclarationError(f"cannot write a video to {path}: it must end in .gif or .mp4")
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         # In the same folder, since renaming works only within a file system, and with the suffix
         # last, since ffmpeg goes by it.
         self._part = self.path.with_name(f".{self.path.stem}.{os.getpid()}{self.path.suffix}")
         self._shape: tuple[int, ...] | None = None
         gif = suffix == ".gif"
-        self._sink = _Gif(self._part, fps) if gif else _Mp4(self._part, fps, most_bits)
+        with written(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._sink = _Gif(self._part, fps) if gif else _Mp4(self._part, fps, most_bits)
 
     def add(self, frame: Array, seconds: float | None = None) -> None:
         """Append a frame (H, W, 3) uint8 that stays for ``seconds``, by default 1 / fps."""
@@ -54,7 +57,8 @@ class VideoWriter:
         if frame.shape != (self._shape or frame.shape):
             raise EnvError(f"the frames' size changed from {self._shape} to {frame.shape}")
         self._shape = frame.shape
-        self._sink.add(frame, seconds)
+        with written(self.path):
+            self._sink.add(frame, seconds)
         self.frames += 1
 
     def __enter__(self) -> Self:
@@ -62,13 +66,19 @@ class VideoWriter:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
-            self._sink.close(complete=kind is None)
-            if kind is None and not self.frames:
+            if kind is not None:
+                with suppress(OSError):  # the error that ended the block is raised
+                    self._sink.close(complete=False)
+                return
+            with written(self.path):
+                self._sink.close(complete=True)
+            if not self.frames:
                 raise RunError(f"no frames were given for {self.path}")
-            if kind is None:
+            with written(self.path):
                 os.replace(self._part, self.path)
         finally:
-            self._part.unlink(missing_ok=True)
+            with suppress(OSError):
+                self._part.unlink(missing_ok=True)
 
 
 class _Mp4:
@@ -161,8 +171,8 @@ class _Gif:
         self._file.write(b"GIF89a" + screen + colors.tobytes() + endless)
 
     def close(self, complete: bool) -> None:
-        self._file.write(b";")
-        self._file.close()
+        with self._file:
+            self._file.write(b";")
 
 
 def _extent(changed: Array) -> slice:

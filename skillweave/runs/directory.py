@@ -43,6 +43,7 @@ from skillweave.runs.files import (
     TEMPORARY,
     check_no_links,
     check_unchanged,
+    check_utf8,
     make_directory,
     read_tensors,
     record_in,
@@ -155,9 +156,10 @@ class RunDirectory:
 
         Raises:
             RunError: the directory holds a run that has learnt something or that another
-                process trains, or other files.
+                process trains, or other files; or its path is not UTF-8.
         """
         path = absolute(path)
+        check_utf8(path)
         _check_file_names(manifest)
         if path.is_file():
             raise RunError(f"{path} exists and is not an empty directory; choose another")

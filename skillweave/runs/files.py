@@ -10,7 +10,7 @@ import json
 import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -71,6 +71,15 @@ def write_bytes(
         raise
 
 
+@contextmanager
+def written(path: Path) -> Iterator[None]:
+    """Turn an OSError of the block, which writes a file, into a RunError that names ``path``."""
+    try:
+        yield
+    except OSError as error:
+        raise RunError(f"could not write {path}: {error.strerror or error}") from error
+
+
 def move(source: Path, target: Path) -> None:
     """Rename a file, in place of a file with that name.
 
@@ -82,6 +91,17 @@ def move(source: Path, target: Path) -> None:
         _sync(target.parent)
     except OSError as error:
         raise _unwritten(target, error) from error
+
+
+def check_utf8(path: Path) -> None:
+    """Raise a RunError where a path is no UTF-8, because safetensors opens no such file."""
+    try:
+        os.fsencode(path).decode("utf-8")
+    except UnicodeError:
+        raise RunError(
+            f"{str(path)!a} is not UTF-8, and files of weights cannot be read from such a path: "
+            "choose another folder, or rename it"
+        ) from None
 
 
 def make_directory(path: Path) -> None:
@@ -203,7 +223,11 @@ def write_tensors(
     Args:
         header: a dataclass, or a dict.
         make_directories: make those above it, where they are missing.
+
+    Raises:
+        RunError: it cannot be written, or not be read from there again.
     """
+    check_utf8(path)
     plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
     whole = {"schema": SCHEMA, **as_json(header)}
     whole["sha256"] = _digest(path, whole, plain)
@@ -259,6 +283,7 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def _open(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    check_utf8(path)
     check_file(path)
     try:
         # Before 0.5, safetensors creates tensors on the default device, which the user may change.

@@ -18,7 +18,7 @@ from skillweave.spaces.choices import (
     numbered_choice_codec,
 )
 from skillweave.spaces.observations import ObsCodec, obs_codec, to_tensor
-from skillweave.spaces.packing import obs_dtype, obs_shape, pack, put_observation, unpack
+from skillweave.spaces.packing import leaves, obs_dtype, obs_shape, pack, put_observation, unpack
 from skillweave.spaces.saving import other_bounds, same_space, space_from_json, space_to_json
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "action_codec",
     "choice_codec",
     "choice_counts",
+    "leaves",
     "numbered_choice_codec",
     "obs_codec",
     "obs_dtype",

@@ -6,6 +6,7 @@ Dict and Tuple become structured arrays, so that ``obs[rows]``, ``obs[rows] = x`
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -191,3 +192,11 @@ def unpack(space: gym.Space[Any], array: Array) -> Any:
         return array
     values = {name: unpack(part, array[name]) for name, part in inner.items()}
     return tuple(values.values()) if isinstance(space, gym.spaces.Tuple) else values
+
+
+def leaves(obs: Array) -> Iterator[Array]:
+    """Yield the innermost parts of observations (n, ...), which share their memory."""
+    for name in obs.dtype.names or ():
+        yield from leaves(obs[name])
+    if obs.dtype.names is None:
+        yield obs

@@ -182,6 +182,54 @@ def test_a_log_is_saved_and_read(log, tmp_path):
             assert np.array_equal(column, other), name
 
 
+class Nested(gym.Env[Any, Any]):
+    """A Dict, with a Tuple in it, in a Dict; episodes of ten steps."""
+
+    observation_space = gym.spaces.Dict(
+        {
+            "far": gym.spaces.Box(-1, 1, (2,), np.float32),
+            "inner": gym.spaces.Dict(
+                {
+                    "near": gym.spaces.Box(-1, 1, (3,), np.float64),
+                    "pair": gym.spaces.Tuple((gym.spaces.Discrete(3), gym.spaces.MultiBinary(2))),
+                }
+            ),
+        }
+    )
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        self.left = 10
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        self.left -= 1
+        return self.observation_space.sample(), 0.0, False, self.left == 0, {}
+
+
+def test_a_log_of_a_dict_in_a_dict_is_read_again(tmp_path):
+    spec = EnvSpec(Nested, engine="sync")
+
+    class Move(Skill):
+        max_steps = 3
+        policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), *spec.spaces)
+
+    path = tmp_path / "nested.safetensors"
+    made = record_calls(spec, SkillSet((Move(),), (Move.policy,)), 40, num_envs=2)
+    made.save(path)
+    read = CallLog.load(path)
+    for name, column in columns_of(made).items():
+        assert columns_of(read)[name].tobytes() == column.tobytes(), name
+    tensors, header = read_tensors(path)
+    near = tensors["next_obs"].numpy().view(made.next_obs.dtype)["inner"]["near"]
+    near[0, 0, 1] = np.nan
+    write_tensors(path, tensors, header)
+    with pytest.raises(RunError, match="'next_obs' is not finite"):
+        CallLog.load(path)
+
+
 DAMAGE = {
     "offset": (lambda x: x[::-1].copy(), "'offset' is out of range"),
     "choice": (lambda x: x + 4, "'choice' is out of range"),

@@ -1,0 +1,100 @@
+"""Words that people of other tools type, and what to write here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+
+from skillweave._internal.messages import ELSEWHERE, suggest
+
+COMMANDS = {
+    "enjoy": "evaluate, or render for a film",
+    "fit": "train",
+    "learn": "train",
+    "play": "render",
+    "record": "render, or log for calls",
+    "test": "evaluate",
+    "tune": "sweep, or train with --evolve population=8",
+    "version": "skillweave --version",
+}
+"""By commands of other tools, the words for it here."""
+OPTIONS = {
+    "algo": "--set selector=DQN, and --set skills.NAME=SAC for a skill",
+    "capture-video": "--render",
+    "checkpoint": "skillweave resume RUN, or --start-from RUN",
+    "config": "--set NAME=VALUE, once for each setting",
+    "cuda": "--set selector.device=cuda, and --set skills.NAME.device=cuda for a skill",
+    "env": "a Python file with a Hierarchy in it, and skillweave train FILE.py",
+    "exp-name": "--out DIR",
+    "gpu": "--set selector.device=cuda, and --set skills.NAME.device=cuda for a skill",
+    "num-workers": "--collectors N",
+    "seeds": "skillweave sweep RECIPE --seeds 0:5",
+    "tensorboard": "--track tensorboard",
+    "timesteps": "--set steps=N",
+    "wandb": "--track wandb",
+}
+"""By options of other tools, the words for it here."""
+SAME = {
+    "algorithm": "algo",
+    "env-id": "env",
+    "load": "checkpoint",
+    "log-dir": "exp-name",
+    "max-steps": "timesteps",
+    "n-timesteps": "timesteps",
+    "name": "exp-name",
+    "output-dir": "exp-name",
+    "run-name": "exp-name",
+    "steps": "timesteps",
+    "total-steps": "timesteps",
+    "total-timesteps": "timesteps",
+    "video": "capture-video",
+    "workers": "num-workers",
+}
+"""Other names of these options."""
+
+
+def foreign_words(words: Sequence[str], commands: Mapping[str, type]) -> str:
+    """Return a sentence on a command or an option of another tool; empty: there is none.
+
+    Args:
+        words: the command line.
+        commands: by name, the dataclass of its options.
+    """
+    if not words or words[0].startswith("-"):
+        return ""
+    name, *rest = words
+    if name not in commands:
+        way = COMMANDS.get(name)
+        meant = f": write {way}" if way else suggest(name, commands)
+        return f"no command {name!r}{meant} (skillweave --help)"
+    known = {field.name.replace("_", "-") for field in fields(commands[name])}
+    for word in rest:
+        option = word.partition("=")[0].removeprefix("--").replace("_", "-").lower()
+        if not word.startswith("--") or option in known:
+            continue
+        if way := _way(option, "set" in known):
+            return f"{name} has no option --{option}: write {way} (skillweave {name} --help)"
+    return ""
+
+
+def _way(option: str, trains: bool) -> str | None:
+    """Return what to write for an option of another tool; None: it is unknown.
+
+    Args:
+        option: without dashes before it.
+        trains: the command has settings.
+    """
+    if not trains:
+        return None
+    if way := OPTIONS.get(SAME.get(option, option)):
+        return way
+    from skillweave.algorithms.config import DQN, PPO, SAC, TD3
+    from skillweave.training.options import Reports
+
+    setting = option.replace("-", "_")
+    setting = ELSEWHERE.get(setting, setting)
+    if any(setting == field.name for field in fields(Reports)):
+        return f"--set train.{setting}=VALUE"
+    if any(setting == field.name for kind in (PPO, DQN, TD3, SAC) for field in fields(kind)):
+        return f"--set selector.{setting}=VALUE, and --set skills.NAME.{setting}=VALUE for a skill"
+    return None
