@@ -126,7 +126,10 @@ def _start_from(words: Sequence[str]) -> str | dict[str, str] | None:
 
 def _verdict(hierarchy: dict[str, Any], flat: dict[str, Any]) -> list[str]:
     """Return in plain words which evaluation is better, and what that means."""
-    (low, high), (flat_low, flat_high) = hierarchy["ci95"], flat["ci95"]
+    # Episodes that are all alike have no interval: they are one.
+    (low, high), (flat_low, flat_high) = (
+        score["ci95"] or (score["mean"], score["mean"]) for score in (hierarchy, flat)
+    )
     both = f"hierarchy {hierarchy['mean']:.1f}, flat agent {flat['mean']:.1f} with as many steps"
     if low > flat_high:
         return [f"{both}: the hierarchy is better."]

@@ -21,14 +21,16 @@ from typing import Any, Protocol
 import gymnasium as gym
 import numpy as np
 
+from skillweave._internal.messages import short
 from skillweave._internal.notices import are_collected, notice
 from skillweave._internal.seeding import GlobalDraws, Seeds, global_generators
 from skillweave.envs.checks import Watch, time_limit
 from skillweave.envs.history import History
-from skillweave.envs.infos import ActionMasks, allowed_rows, random_actions
+from skillweave.envs.infos import ActionMasks, allowed_rows, random_actions, time_limits
 from skillweave.errors import EnvError, SkillweaveError, reworded
-from skillweave.policies.infos import batched_infos
+from skillweave.policies.infos import InfoKeys, batched_infos
 from skillweave.policies.spaces import space_of
+from skillweave.skills.outputs import keys_of
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, Step
 
@@ -142,6 +144,7 @@ class WatchedEngine:
         self._root = 0
         self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
         self._masks = ActionMasks(self.action_space, num_envs, seen)
+        self._keys = InfoKeys()
         self._watch = Watch(name, self.observation_space, num_envs, first)
         action = np.zeros((num_envs, *obs_shape(self.action_space)), obs_dtype(self.action_space))
         self._history = History(num_envs, action)
@@ -157,6 +160,14 @@ class WatchedEngine:
         """Return the actions allowed in the latest observations, (N, A) bool; None: always all."""
         return self._masks.now
 
+    def close(self) -> None:
+        """Give a notice of keys of info that were read, and that no environment has given."""
+        for key in sorted(self._keys.asked):
+            notice(
+                f"{self._name}: no environment set info[{short(key)}], which is read: 0 stood in "
+                f"its place (the keys are: {keys_of(self._keys.examples)})"
+            )
+
     def _act(self, action: Array, ids: Array) -> RawStep:
         """Step environments ``ids`` (n,), also again, without an entry in the history."""
         raise NotImplementedError
@@ -169,9 +180,16 @@ class WatchedEngine:
 
     def _stepped(self, raw: RawStep, ids: Array) -> RawStep:
         """Return the result of a step, which is checked, and truncated after too many steps."""
-        self._masks.see(raw.info, ids, raw.terminated | raw.truncated, raw.next_obs)
+        n, over = len(ids), raw.terminated | raw.truncated
+        self._masks.see(raw.info, ids, over, raw.next_obs)
         self._watch.check_step(raw, ids)
+        ended = b"\1" in over.tobytes()  # for small arrays ten times as fast as any()
+        if ended:
+            limited = time_limits(raw.info, n)
+            raw.terminated = raw.terminated & ~limited
+            raw.truncated = raw.truncated | (over & limited)
         raw.truncated = (raw.truncated | self._watch.too_long(ids)) & ~raw.terminated
+        raw.info = self._keys.see(raw.info, n, ended=ended)
         return raw
 
 
@@ -199,7 +217,8 @@ class GymnasiumEngine(WatchedEngine):
                 self.envs.append(self._made(make, number))
             self._check_alike(name)
         except BaseException:
-            self.close()
+            for env in self.envs:
+                env.close()
             raise
         env = self.envs[0]
         super().__init__(env, num_envs, name, first, env.observation_space)
@@ -266,6 +285,7 @@ class GymnasiumEngine(WatchedEngine):
 
     def close(self) -> None:
         """Close all environments."""
+        super().close()
         for env in self.envs:
             env.close()
 

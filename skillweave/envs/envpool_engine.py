@@ -147,6 +147,7 @@ class EnvPoolEngine(WatchedEngine):
 
     def close(self) -> None:
         """Release the environments."""
+        super().close()
         self._pools = []
 
     def _begin(self, ids: Array) -> Array:

@@ -9,9 +9,10 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.messages import short
+from skillweave._internal.notices import notice
 from skillweave.errors import EnvError
 from skillweave.policies.core import OWN_REWARD, SUCCESS
-from skillweave.policies.infos import NUMBERS, batched_infos
+from skillweave.policies.infos import Infos, batched_infos, one_number
 from skillweave.policies.spaces import allows_each
 from skillweave.skills.outputs import info_keys
 from skillweave.spaces import (
@@ -153,35 +154,54 @@ IS_SUCCESS = "is_success"
 """The key of success in Stable-Baselines3 and Gymnasium-Robotics."""
 
 
+TIME_LIMITS = ("TimeLimit.truncated", "time_outs")
+"""Keys that are true where an end is a time limit: of old Gym and Stable-Baselines3, and of
+simulators of robots (Isaac, rsl_rl)."""
+
+
+def time_limits(info: Mapping[str, Any], n: int) -> Array:
+    """Return where the infos of n environments say that an end is a time limit, (n,) bool."""
+    found = np.zeros(n, bool)
+    for key in TIME_LIMITS:
+        if key in info:
+            found |= _column(info, key, n)[0] == 1
+    return found
+
+
 def reported_success(info: Mapping[str, Any], n: int) -> Array | None:
     """Return the success of n environments' episodes by ``info["success"]``.
 
     Where that is missing, ``info["is_success"]`` counts.
 
     Returns:
-        (n,) float64, NaN where an environment reports none; None: no environment reports any.
+        (n,) float64: 1 or 0; 0 where an environment gives no such key; NaN where it gives None, or
+        no number. None: no environment has given such a key so far.
     """
-    success = _success(info, SUCCESS, n)
-    if OWN_REWARD in info:  # the success of the environment is not the task's
-        return success
-    other = _success(info, IS_SUCCESS, n)
-    if success is None or other is None:
-        return other if success is None else success
-    return np.where(np.isnan(success), other, success)
-
-
-def _success(info: Mapping[str, Any], key: str, n: int) -> Array | None:
-    success = np.asarray(info.get(key))
-    if success.shape == (n,) and success.dtype == object:  # for example None until it is known
-        known = [isinstance(value, NUMBERS) for value in success]
-        if not any(known):
-            return None
-        values = [v != 0 if k else np.nan for v, k in zip(success, known, strict=True)]
-        return np.array(values, float)
-    if success.shape != (n,) or success.dtype.kind not in "biuf":
+    # The success of a task's environment is not the task's.
+    names = (SUCCESS,) if OWN_REWARD in info else (SUCCESS, IS_SUCCESS)
+    so_far = info.keys_so_far.examples if isinstance(info, Infos) else {}
+    if not any(name in info or name in so_far for name in names):
         return None
-    present = np.asarray(info.get(f"_{key}", np.ones(n, bool)))
-    return np.where(present, success != 0, np.nan)
+    success, given = np.zeros(n), np.zeros(n, bool)
+    for name in reversed(names):
+        if name in info:
+            values, present, _ = _column(info, name, n)
+            known = ~np.isnan(values)
+            success[present & ~known & ~given] = np.nan
+            success[known] = values[known] != 0
+            given |= known
+    return success
+
+
+def notice_odd_success(info: Mapping[str, Any], n: int) -> None:
+    """Give a notice where one of n environments gives a success that is not understood."""
+    for key in (SUCCESS, IS_SUCCESS):
+        if key in info and (odd := _column(info, key, n)[2]):
+            notice(
+                f"info[{key!r}] is {odd}, so it does not count as the success of an episode: let "
+                "the environment set True or False there"
+            )
+            return
 
 
 def info_numbers(info: Mapping[str, Any], key: str, ids: Array, n: int) -> Array | None:
@@ -197,24 +217,44 @@ def info_numbers(info: Mapping[str, Any], key: str, ids: Array, n: int) -> Array
         key = IS_SUCCESS
     if key not in info:
         return None
-    values = info[key]
-    present = np.asarray(info.get(f"_{key}", np.ones(n, bool)))[ids]
+    values, present, odd = _column(info, key, n, ids)
     if not present.any():
         return None
-    if not isinstance(values, np.ndarray) or values.shape[:1] != (n,):
-        raise _no_number(key, f"of type {type(values).__name__}")
-    if values.size > n:
-        raise _no_number(key, f"an array of shape {values.shape[1:]}")
-    numbers = np.full(len(ids), np.nan)
+    if odd is not None:
+        raise _no_number(key, odd)
+    values[~np.isfinite(values)] = np.nan
+    return values
+
+
+def _column(
+    info: Mapping[str, Any], key: str, n: int, ids: Array | None = None
+) -> tuple[Array, Array, str | None]:
+    """Return the only number of each environment under a key, in any wrapping.
+
+    Args:
+        n: the number of environments in the info.
+        ids: (k,) some of them; None: all.
+
+    Returns:
+        (k,) float64, NaN where it is not known, or no number; (k,) bool, where an environment gives
+        the key; and in words the first value that is no number, None if all are.
+    """
+    ids = np.arange(n) if ids is None else ids
+    present = np.broadcast_to(np.asarray(info.get(f"_{key}", True), bool), n)[ids]
+    column = info[key]
+    batched = isinstance(column, np.ndarray) and column.shape[:1] == (n,)
+    if batched and column.size == n and column.dtype.kind in "biuf":
+        return np.where(present, column.reshape(n)[ids], np.nan).astype(float), present, None
+    numbers, odd = np.full(len(ids), np.nan), None
     for row in np.flatnonzero(present):
-        value = values.reshape(n)[ids[row]]
-        if value is None:
-            continue
-        if not isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating):
-            raise _no_number(key, f"of type {type(value).__name__}")
-        numbers[row] = value
-    numbers[~np.isfinite(numbers)] = np.nan
-    return numbers
+        value = column[ids[row]] if batched else column
+        number = one_number(value)
+        if number is not None:
+            numbers[row] = number
+        elif odd is None:
+            shape = np.shape(value) if isinstance(value, np.ndarray) else ()
+            odd = f"an array of shape {shape}" if shape else f"of type {type(value).__name__}"
+    return numbers, present, odd
 
 
 def _no_number(key: str, what: str) -> EnvError:

@@ -13,7 +13,7 @@ from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds, seed_global_generators
 from skillweave.algorithms.batches import Batch, Trace, padded_last_axis, side_by_side
 from skillweave.envs.engine import Engine, RawStep, checksums
-from skillweave.envs.infos import info_numbers, reported_success
+from skillweave.envs.infos import info_numbers, notice_odd_success, reported_success
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.acting import Acting, Request
 from skillweave.experience.learners import Alone, Calling, LevelLearners, OneLearner
@@ -501,7 +501,10 @@ class Collector:
             episodes[:, TASK_RETURN] = 0.0
         if self.skill is None or not self.skill.defines("reward"):  # the reward is the task's
             success = reported_success(info, self.num_envs)
-            episodes[:, SUCCESS] = np.nan if success is None else success[ids]
+            if success is not None:
+                episodes[:, SUCCESS] = success[ids]
+                if np.isnan(success[ids]).any():
+                    notice_odd_success(info, self.num_envs)
         self._ended.append((row, ids, episodes))
 
 

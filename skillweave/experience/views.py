@@ -16,6 +16,7 @@ from skillweave._internal.messages import short
 from skillweave.algorithms.batches import OF_STEP, Batch, Trace
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.policies.core import OWN, RUNNING, own_step, part_of
+from skillweave.policies.infos import Infos
 from skillweave.skills import Skill, asked
 from skillweave.skills.goals import Goals, check_reads_goal
 from skillweave.skills.outputs import missing_key
@@ -223,7 +224,8 @@ def info_numbers_of(trace: Trace, key: str) -> Array:
     """
     values = []
     for info in trace.infos:
-        if key not in info:
+        known = info.keys_so_far.examples if isinstance(info, Infos) else info
+        if key not in known:
             raise EnvError(f"info[{key!r}] is to be recorded, but {missing_key(info)}")
         values.append(np.asarray(info[key]))
         if values[-1].dtype.kind not in "biuf" or values[-1].shape[:1] != trace.lead[1:]:
@@ -247,11 +249,12 @@ class JointInfo(Mapping[str, Any]):
         self, infos: Sequence[Mapping[str, Any]], acts: Array, whole: JointInfo | None = None
     ) -> None:
         self._infos, self._acts, self._whole = infos, acts, whole
+        self.keys_so_far = getattr(infos[0], "keys_so_far", None) if infos else None
         self.mixed = False
         """A key was read that cannot be joined: it differs in its kind between steps."""
 
     def __getitem__(self, key: str) -> Any:
-        values = [info[key] for info in self._infos if key in info]
+        values = [info[key] for info in self._infos if key in info or isinstance(info, Infos)]
         if not values:
             raise KeyError(key)
         first, envs = values[0], self._acts.shape[1]
@@ -270,6 +273,17 @@ class JointInfo(Mapping[str, Any]):
         else:
             self._mix()
         return first
+
+    def __contains__(self, key: object) -> bool:
+        given = [key in info for info in self._infos]
+        if any(given) and not all(given):
+            self._mix()
+        return any(given)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return what environments give under a key in these steps, without what is missing."""
+        given = key in self
+        return self[key] if given else default
 
     def __iter__(self) -> Iterator[str]:
         keys = {key: None for info in self._infos for key in info}

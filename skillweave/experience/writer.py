@@ -10,6 +10,7 @@ import numpy as np
 
 from skillweave.algorithms.batches import Trace, column
 from skillweave.errors import EnvError
+from skillweave.policies.infos import with_missing
 from skillweave.types import Array
 
 
@@ -68,7 +69,8 @@ def kept_info(info: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return an info that stays as it is: objects are copied, as environments may change them."""
     if all(isinstance(v, np.ndarray) and v.dtype != object for v in info.values()):
         return info
-    return {key: _copied(value, key) for key, value in info.items()}
+    kept = {key: _copied(value, key) for key, value in info.items()}
+    return with_missing(kept, info, getattr(info, "n", 0))
 
 
 def _copied(value: Any, key: str) -> Any:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import SkillError
+from .infos import with_missing
 
 Array: TypeAlias = NDArray[Any]
 Memory: TypeAlias = dict[str, Any]
@@ -132,7 +133,8 @@ def info_rows(info: Mapping[str, Any], rows: Array, n: int) -> dict[str, Any]:
 
     Values that are not arrays over the n environments are returned unchanged.
     """
-    return {key: _rows(value, rows, n) for key, value in info.items()}
+    part = {key: _rows(value, rows, n) for key, value in info.items()}
+    return with_missing(part, info, len(rows))
 
 
 def _rows(value: Any, rows: Array, n: int) -> Any:
@@ -158,7 +160,8 @@ def own_step(step: Step) -> Step:
     for mark in ("", "_"):  # batches mark under "_key" where a key is there
         if mark + OWN_SUCCESS in info:
             info[mark + SUCCESS] = info.pop(mark + OWN_SUCCESS)
-    return replace(step, reward=np.asarray(step.info[OWN_REWARD], np.float32), info=info)
+    reward = np.asarray(step.info[OWN_REWARD], np.float32)
+    return replace(step, reward=reward, info=with_missing(info, step.info, len(reward)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,13 +3,116 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from contextlib import suppress
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .core import Array
+Array: TypeAlias = NDArray[Any]
 
 NUMBERS = bool | int | float | np.number | np.bool_
+LATE = 1_000
+"""Steps after which a key that is asked for, and that no environment has given, is refused."""
+
+
+class Infos(dict[str, Any]):
+    """A batched info of n environments: ``infos[key]`` of a key that none gives now is 0 or None.
+
+    ``in``, ``get`` and iteration see only what the environments give in this step.
+
+    Args:
+        info: what they give.
+        keys: those that they have given so far.
+        n: their number.
+    """
+
+    __slots__ = ("keys_so_far", "n")
+
+    def __init__(self, info: Mapping[str, Any], keys: InfoKeys, n: int) -> None:
+        super().__init__(info)
+        self.keys_so_far, self.n = keys, n
+
+    def __missing__(self, key: str) -> Any:
+        return self.keys_so_far.missing(key, self.n)
+
+
+def with_missing(part: dict[str, Any], info: Mapping[str, Any], n: int) -> dict[str, Any]:
+    """Return a part of a batched info, of n rows, in which the same is missing as in ``info``."""
+    keys = getattr(info, "keys_so_far", None)
+    return part if keys is None else Infos(part, keys, n)
+
+
+class InfoKeys:
+    """The keys that some environments have given in their infos so far.
+
+    A key that is asked for before any environment has given it may come later, so it is 0 until an
+    episode has ended and ``LATE`` steps are over.
+    """
+
+    def __init__(self) -> None:
+        self.examples: dict[str, Any] = {}
+        """By key, the first column; of a dict its own ``InfoKeys``."""
+        self.asked: set[str] = set()
+        """Keys that were asked for, and that no environment has given."""
+        self._steps, self._ended = 0, False
+
+    def see(self, info: Mapping[str, Any], n: int, *, ended: bool = False) -> Infos:
+        """Return the batched info of a step of n environments, with what is missing in it.
+
+        Args:
+            ended: an episode ended in this step.
+        """
+        self._steps += n
+        self._ended |= ended
+        found = Infos(info, self, n)
+        if not info.keys() <= self.examples.keys():
+            for key in info.keys() - self.examples.keys():
+                value = info[key]
+                self.examples[key] = InfoKeys() if isinstance(value, dict) else value
+            self.asked -= self.examples.keys()
+        for key, value in info.items():
+            if isinstance(value, dict) and isinstance(inner := self.examples[key], InfoKeys):
+                found[key] = inner.see(value, n, ended=ended)
+        return found
+
+    def missing(self, key: str, n: int) -> Any:
+        """Return the column of a key that no environment gives in a step.
+
+        Raises:
+            KeyError: no environment has given it in a long time.
+        """
+        if key in self.examples:
+            example = self.examples[key]
+            if isinstance(example, InfoKeys):
+                return Infos({}, example, n)
+            if not isinstance(example, np.ndarray) or example.dtype == object:
+                return np.full(n, None, object)
+            return np.zeros((n, *example.shape[1:]), example.dtype)
+        if not isinstance(key, str) or (self._ended and self._steps >= LATE):
+            self.asked.discard(key)
+            raise KeyError(key)
+        if key.startswith("_"):
+            return np.zeros(n, bool)
+        self.asked.add(key)
+        return np.zeros(n)
+
+
+def one_number(value: Any) -> float | None:
+    """Return the only number in a value: alone, in an array, a tensor or a list; None: it has none.
+
+    None and a NaN are the number that is not known, NaN.
+    """
+    while isinstance(value, list | tuple) and len(value) == 1:
+        value = value[0]
+    if callable(item := getattr(value, "item", None)):  # an array's, a tensor's
+        with suppress(Exception):
+            value = item()
+    if value is None:
+        return np.nan
+    if not isinstance(value, NUMBERS) or isinstance(value, np.complexfloating):
+        return None
+    return float(value)
 
 
 def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

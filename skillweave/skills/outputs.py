@@ -13,7 +13,7 @@ import numpy as np
 from skillweave._internal.messages import error_text, short, suggest
 from skillweave._internal.tracebacks import is_users
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
-from skillweave.policies.infos import NUMBERS
+from skillweave.policies.infos import NUMBERS, Infos
 from skillweave.skills.probing import probe, watch
 from skillweave.types import LARGEST_REWARD, Array, Step, read_only, wrong_reward
 
@@ -277,9 +277,11 @@ def info_keys(info: Mapping[str, Any]) -> tuple[str, ...]:
 
 def missing_key(info: Mapping[str, Any]) -> str:
     """Return a clause on a key that no environment sets."""
+    far = isinstance(info, Infos)
+    keys = keys_of(info.keys_so_far.examples if isinstance(info, Infos) else info)
     return (
-        f"no environment set this key of info in this step (the keys are: {keys_of(info)}): let "
-        "the environment set it in each step"
+        f"no environment set this key of info {'so far' if far else 'in this step'} (the keys are: "
+        f"{keys}): let the environment set it in each step"
     )
 
 

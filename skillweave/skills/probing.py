@@ -31,6 +31,7 @@ from skillweave._internal.messages import error_text
 from skillweave._internal.notices import notice
 from skillweave._internal.tracebacks import is_own_code
 from skillweave.errors import SkillError, SkillweaveError
+from skillweave.policies.infos import with_missing
 from skillweave.policies.spaces import Space, discrete
 from skillweave.types import Array, Step, read_only
 
@@ -283,7 +284,8 @@ def _taken(given: Any, rows: Array, n: int, factor: float = 1.0) -> Any:
         kind: Any = type(given)
         return kind(**parts)
     if isinstance(given, Mapping):
-        return {key: _taken(value, rows, n, factor) for key, value in given.items()}
+        part = {key: _taken(value, rows, n, factor) for key, value in given.items()}
+        return with_missing(part, given, len(rows))
     if isinstance(given, np.ndarray) and given.shape[:1] == (n,):
         taken = given[rows]
         if factor != 1.0:

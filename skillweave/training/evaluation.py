@@ -21,7 +21,7 @@ from skillweave._internal.seeding import Seeds, global_generators
 from skillweave._internal.terminal import printable
 from skillweave.envs.checks import longest_evaluation, time_limit
 from skillweave.envs.engine import Engine, checksums
-from skillweave.envs.infos import reported_success
+from skillweave.envs.infos import notice_odd_success, reported_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.envs.pool import POOL_SEEDS
 from skillweave.errors import DeclarationError, SkillweaveError
@@ -56,6 +56,8 @@ USUAL_ENVS = 16
 SEEMS_ENDLESS = 1_000
 """Steps of an episode without a known limit after which an evaluation says where it will be cut."""
 
+ALIKE = "which are the same in every step: they count as one, without an interval"
+"""Words on episodes that are all alike."""
 NOT_LOGGED = "no calls were logged in this evaluation: evaluate(log_calls=True) logs them"
 SCORE_ALONE = 'evaluate(skill="go_to") scores a skill alone'
 
@@ -90,6 +92,10 @@ class Evaluation:
     succeeded: Count | None = None
     """Episodes that succeeded by ``info["success"]`` (else ``info["is_success"]``) of their last
     step; None: without these keys."""
+    succeeded_once: Count | None = None
+    """Episodes that succeeded by these keys in some step; None: without these keys."""
+    all_alike: bool = False
+    """There are several episodes, and all are the same in every step: their number says nothing."""
     reflexes: dict[str, Count] = field(default_factory=dict)
     """Steps in which each reflex acted, by its path."""
     alone: str | None = None
@@ -173,6 +179,11 @@ class Evaluation:
         """Share of episodes that succeeded; None: unknown."""
         return None if self.succeeded is None else self.succeeded / len(self.returns)
 
+    @property
+    def success_once_rate(self) -> float | None:
+        """Share of episodes that succeeded in some step; None: unknown."""
+        return None if self.succeeded_once is None else self.succeeded_once / len(self.returns)
+
     def to_json(self) -> dict[str, Any]:
         """Return the summary as plain JSON."""
         returns = np.array(self.returns)
@@ -185,7 +196,7 @@ class Evaluation:
             "episodes": n,
             "mean": self.mean,
             "std": std,
-            "ci95": [self.mean - half, self.mean + half],
+            "ci95": None if self.all_alike else [self.mean - half, self.mean + half],
             "iqm": interquartile_mean(returns),
             "median": float(np.median(returns)),
             "min": float(returns.min()),
@@ -193,6 +204,8 @@ class Evaluation:
             "threshold": self.threshold,
             "solved_fraction": self.solved_fraction,
             "success_rate": self.success_rate,
+            "success_once_rate": self.success_once_rate,
+            "all_alike": self.all_alike,
             "length_mean": float(np.mean(self.lengths)),
             "cut": self.cut,
             "skill_usage": {k: v["share"] for k, v in skills.items() if k != self.alone},
@@ -228,16 +241,20 @@ class Evaluation:
     def __str__(self) -> str:
         j = self.to_json()
         digits = 2 if max(map(abs, self.returns)) < 10 else 1  # many are shares: 0 to 1
-        mean, std, low, high, iqm = (
-            f"{value:.{digits}f}" for value in (self.mean, j["std"], *j["ci95"], j["iqm"])
-        )
-        line = (
-            f"{mean} ± {std} over {len(self.returns)} episodes (95 % CI {low} to {high}, IQM {iqm})"
-        )
+        n = len(self.returns)
+        if self.all_alike:
+            line = f"{self.mean:.{digits}f} over {n} episodes, {ALIKE}"
+        else:
+            mean, std, low, high, iqm = (
+                f"{value:.{digits}f}" for value in (self.mean, j["std"], *j["ci95"], j["iqm"])
+            )
+            line = f"{mean} ± {std} over {n} episodes (95 % CI {low} to {high}, IQM {iqm})"
         if self.solved_fraction is not None:
             line += f", {self.solved_fraction:.0%} at {self.threshold:g} or more"
         if self.success_rate is not None:
             line += f", {self.success_rate:.0%} succeed"
+            if self.succeeded_once not in (None, self.succeeded):
+                line += f" at the end ({self.success_once_rate:.0%} in some step)"
         line += f", {j['length_mean']:.0f} steps an episode"
         if self.cut:
             most = f"{max(self.lengths):,} steps (max_steps)"
@@ -437,11 +454,13 @@ def _scored(
 ) -> Evaluation:
     """Play all episodes and return their scores."""
     returns, lengths, cut = np.zeros(episodes), np.zeros(episodes, np.int64), 0
-    success, skill, goals = np.full(episodes, np.nan), calls.alone, None
+    success, skill, goals = np.zeros(episodes), calls.alone, None
+    success_known, once, alike = False, np.zeros(episodes, bool), SameEpisodes()
     has_skills = skill is not None or bool(policy.labels)
     if (own := goals_of(skill)) is not None:
         goals = own.start(episodes)
     for played in moments:
+        alike.see(played)
         returns[played.episode] += played.reward
         lengths[played.episode] += played.lasted
         cut += int(played.cut.sum())
@@ -451,7 +470,11 @@ def _scored(
             goals[played.episode] = played.memory[OWN_GOAL][played.rows]
         succeeded = reported_success(played.step.info, len(played.rows))
         if succeeded is not None:
+            success_known = True
             success[played.episode[played.over]] = succeeded[played.over]
+            once[played.episode[succeeded > 0]] = True
+            if np.isnan(succeeded[played.over]).any():
+                notice_odd_success(played.step.info, len(played.rows))
         if watch is not None:
             watch(played)
     reached = None
@@ -459,17 +482,43 @@ def _scored(
         rows, reached = calls.recorders()[""].rows(), np.zeros(episodes, bool)
         reached[rows["episode"]] = rows["succeeded"]
     handovers = tuple(weak_handovers(calls)) if has_skills else ()
+    success_known &= not np.isnan(success).any()
     return Evaluation(
         tuple(returns.tolist()),
         tuple(lengths.tolist()),
         threshold,
         skill_reports(calls) if has_skills else {},
         cut,
-        None if np.isnan(success).any() else int(success.sum()),
-        dict(calls.reflexes),
-        None if skill is None else policy.path,
-        Details(None, handovers, goals, reached),
+        succeeded=int(success.sum()) if success_known else None,
+        succeeded_once=int(once.sum()) if success_known else None,
+        all_alike=episodes > 1 and alike.so_far,
+        reflexes=dict(calls.reflexes),
+        alone=None if skill is None else policy.path,
+        details=Details(None, handovers, goals, reached),
     )
+
+
+class SameEpisodes:
+    """A comparison of episodes that ends where the first step of one differs from the others."""
+
+    def __init__(self) -> None:
+        self.so_far = True
+        """All episodes so far are the same in every step."""
+        self._steps: list[int] = []  # a checksum of each
+
+    def see(self, played: Played) -> None:
+        """Compare the next step of some episodes."""
+        if not self.so_far:
+            return
+        step, over = played.step, played.over
+        columns = (step.obs, step.action, step.reward, step.next_obs, over)
+        sums = zip(*(checksums(column).tolist() for column in columns), strict=True)
+        for elapsed, found in zip(step.elapsed.tolist(), map(hash, sums), strict=True):
+            if elapsed > len(self._steps):
+                self._steps.append(found)
+            elif self._steps[elapsed - 1] != found:
+                self.so_far = False
+                return
 
 
 K = TypeVar("K")

@@ -70,8 +70,10 @@ def test_one_of_another_shape_is_not_used_and_that_is_said():
 
 
 def test_is_success_counts_where_success_is_missing():
-    info = batched_infos([{"is_success": 1.0}, {"success": False, "is_success": True}, {}])
-    np.testing.assert_array_equal(reported_success(info, 3), [1, 0, np.nan])
+    both = {"success": False, "is_success": True}
+    unknown = {"success": None}
+    infos = [{"is_success": 1.0}, both, {}, unknown, unknown | {"is_success": 1}]
+    np.testing.assert_array_equal(reported_success(batched_infos(infos), 5), [1, 0, 0, np.nan, 1])
     info = batched_infos([{"is_success": True}])
     assert info_numbers(info, "success", np.arange(1), 1).tolist() == [1]
     assert reported_success(info | {"env_reward": np.zeros(1)}, 1) is None  # not the task's

@@ -1,13 +1,16 @@
 """Infos of several environments: a skill reads exactly what each environment gave."""
 
+import json
 from collections import Counter, OrderedDict
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from timed import SMALL, Timed
 
 import skillweave as sw
+from skillweave.envs.make import make_engine
 from skillweave.errors import SkillError
 from skillweave.evolution import Evolution
 
@@ -142,9 +145,158 @@ def test_a_key_that_is_read_must_hold_numbers_in_all_environments(skill, other):
 
 
 def test_a_key_that_nobody_gives_is_named():
-    spec = telling([ABSENT])
+    hierarchy = sw.Hierarchy(
+        telling([ABSENT]), [Scores()], steps=3_000, algorithm=SMALL, selector=SMALL
+    )
     with pytest.raises(SkillError, match=r"no environment set this key .*'always'"):
-        sw.Hierarchy(spec, [Scores()], steps=256, algorithm=SMALL, selector=SMALL).train(quiet=True)
+        hierarchy.train(quiet=True)
+
+
+def test_a_key_that_comes_late_is_zero_before_and_one_that_never_comes_is_said_at_the_end():
+    with pytest.warns(match=r"no environment set info\['told'\].*'always'"):
+        sw.Hierarchy(
+            telling([ABSENT]), [Scores()], steps=256, algorithm=SMALL, selector=SMALL
+        ).train(quiet=True)
+
+
+class Ends(Timed):
+    """Tells its length and a text where an episode ends, and nothing before."""
+
+    def step(self, action):
+        *step, _ = super().step(action)
+        over = step[-1] or step[-2]
+        return *step, {
+            "length": float(self.t),
+            "why": "time",
+            "of": {"t": [self.t]},
+        } if over else {}
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_key_of_some_steps_alone_is_nothing_elsewhere(num_envs, recwarn):
+    paid, given = [], []
+
+    class Counts(sw.Skill):
+        max_steps = 30
+
+        def reward(self, step):
+            length, whys = step.info["length"], step.info["why"]
+            given.append("length" in step.info)
+            assert length.shape == step.reward.shape
+            np.testing.assert_array_equal(step.info["_length"], length > 0)
+            np.testing.assert_array_equal(step.truncated | step.terminated, length > 0)
+            if given.count(True) and not given[-1]:
+                assert all(why is None for why in whys)
+                assert step.info["of"]["t"].tolist() == [None] * len(length)
+                assert step.info.get("length") is None
+            paid.append(length.sum())
+            return length
+
+        def termination(self, step):
+            return step.info["length"] > 0
+
+    ppo = sw.PPO(num_envs=num_envs, n_steps=32, batch_size=32)
+    spec = sw.EnvSpec(Ends, workers=1)
+    sw.Hierarchy(spec, [Counts()], steps=256, algorithm=ppo, selector=ppo).train(quiet=True)
+    assert max(paid) > 0
+    assert not [str(w.message) for w in recwarn if "info" in str(w.message)]
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda x: x,
+        np.asarray,
+        lambda x: np.array([x]),
+        lambda x: np.array([[float(x)]]),
+        torch.tensor,
+        lambda x: torch.tensor([x], requires_grad=False),
+        lambda x: torch.tensor([float(x)], requires_grad=True),
+        lambda x: [x],
+        lambda x: (np.asarray(x),),
+        lambda x: [torch.tensor([x])],
+    ],
+)
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_one_number_in_any_wrapping_is_a_success(wrap, num_envs, tmp_path, recwarn):
+    class Even(Timed):
+        length = 4
+
+        def reset(self, *, seed=None, options=None):
+            found = super().reset(seed=seed)
+            self.even = bool(self.np_random.integers(2))
+            return found
+
+        def step(self, action):
+            *step, _ = super().step(action)
+            return *step, {"success": wrap(self.even), "score": wrap(2.5)}
+
+    policy = sw.from_function(lambda obs: np.zeros(len(obs), int))
+    found = sw.evaluate(policy, Even, episodes=20, num_envs=num_envs)
+    assert found.succeeded in range(1, 20)
+    assert found.succeeded == found.succeeded_once
+    run = sw.train_agent(
+        sw.EnvSpec(Even, workers=1), SMALL, 128, tmp_path / "run", log_info=["score"], quiet=True
+    )
+    last = json.loads((run.path / "metrics.jsonl").read_text().splitlines()[-1])
+    assert last["info/score"] == 2.5
+    assert 0 < last["success"] < 1
+    assert not [str(w.message) for w in recwarn if "success" in str(w.message)]
+
+
+@pytest.mark.parametrize("odd", ["yes", np.array([True, False]), {"door": True}, object()])
+def test_a_success_that_is_no_number_is_said(odd):
+    class Odd(Timed):
+        def step(self, action):
+            *step, _ = super().step(action)
+            return *step, {"success": odd}
+
+    policy = sw.from_function(lambda obs: np.zeros(len(obs), int))
+    with pytest.warns(match=r"info\['success'\] is (of type|an array).*does not count"):
+        assert sw.evaluate(policy, Odd, episodes=3).succeeded is None
+
+
+def test_a_success_that_is_given_only_where_it_is_true_is_a_failure_elsewhere():
+    class Given(Timed):
+        def reset(self, *, seed=None, options=None):
+            found = super().reset(seed=seed)
+            self.wins = bool(self.np_random.integers(2))
+            return found
+
+        def step(self, action):
+            *step, _ = super().step(action)
+            over = step[-1] or step[-2]
+            return *step, {"success": True} if self.wins and over else {}
+
+    policy = sw.from_function(lambda obs: np.zeros(len(obs), int))
+    found = {sw.evaluate(policy, Given, episodes=20, num_envs=n).succeeded for n in (1, 3, 20)}
+    assert len(found) == 1
+    assert 0 < found.pop() < 20
+
+
+@pytest.mark.parametrize("key", ["TimeLimit.truncated", "time_outs"])
+@pytest.mark.parametrize("wrap", [lambda x: x, lambda x: np.array([x]), torch.tensor])
+def test_an_end_that_info_calls_a_time_limit_is_no_termination(key, wrap):
+    class Old(Timed):
+        length = 5
+
+        def reset(self, *, seed=None, options=None):
+            found = super().reset(seed=seed)
+            self.fails = seed % 2
+            return found
+
+        def step(self, action):
+            obs, reward, *_ = super().step(action)
+            fell, limit = self.fails and self.t == 3, self.t == 5
+            return obs, reward, bool(fell or limit), False, {key: wrap(bool(limit))}
+
+    engine = make_engine(sw.EnvSpec(Old), 2)
+    engine.reset_some(np.arange(2), [0, 1])
+    for t in range(1, 6):
+        ids = np.arange(2 if t < 4 else 1)
+        step = engine.step(np.zeros(len(ids), int), ids)
+        assert step.terminated.tolist() == ([False, t == 3] if t < 4 else [False])
+        assert step.truncated.tolist() == ([False, False] if t < 4 else [t == 5])
 
 
 def test_a_success_that_is_not_known_yet_is_no_failure():

@@ -328,17 +328,29 @@ def no_verdict(stages: Sequence[StageEntry]) -> str:
 
 def _outcome(score: Evaluation) -> str:
     """Return the share of episodes that are solved, or their return, in words."""
+    said = _result(score)
+    if score.all_alike:
+        said += ", which are the same in every step: they count as one"
+    if score.succeeded_once not in (None, score.succeeded):
+        said += f"; {percent(score.success_once_rate)} succeed in some step, but not all to the end"
+    return said
+
+
+def _result(score: Evaluation) -> str:
+    """Return the share of episodes that are solved at their end, or their return, in words."""
     n = len(score.returns)
     episodes = "one episode" if n == 1 else f"{n:,} episodes"
     count = solved(score)
     if count is not None:
+        if score.all_alike:
+            return f"Solves {'all' if count else 'none'} of {episodes}"
         if n < FEW:
             return f"Solves {count} of {n} {'episode' if n == 1 else 'episodes'}: too few to judge"
         share = span(wilson(count, n))
         return f"Solves {percent(count / n)} of {episodes}, so probably {share} of all"
     say = partial(number, scale=scale_of(score.returns))
     mean = say(score.mean)
-    if n < FEW:
+    if n < FEW and not score.all_alike:
         return f"Mean return {mean} over {episodes}: too few to judge"
     if score.threshold is not None:
         reached = percent(score.solved_fraction) if score.solved_fraction else "none"
@@ -346,6 +358,8 @@ def _outcome(score: Evaluation) -> str:
             f"Reaches the environment's threshold of {score.threshold:g} in {reached} of "
             f"{episodes} (mean return {mean})"
         )
+    if score.all_alike:
+        return f"Mean return {mean} over {episodes}"
     interval = span(score.to_json()["ci95"], say)
     return f"Mean return {mean} over {episodes} (95 % interval {interval})"
 

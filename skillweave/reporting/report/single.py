@@ -310,10 +310,11 @@ def _add_scores(
 def score_words(score: Evaluation) -> dict[str, Any]:
     """Return the score as texts; digits fit the scale of the returns."""
     score_json, n, count = score.to_json(), len(score.returns), solved(score)
-    say = partial(number, scale=scale_of(score.returns))
+    say, one = partial(number, scale=scale_of(score.returns)), n == 1 or score.all_alike
     return {
         "mean": say(score.mean),
-        "interval": None if n == 1 else span(score_json["ci95"], say),
+        "interval": None if one else span(score_json["ci95"], say),
+        "no_interval": ("one episode" if n == 1 else "all episodes are alike") + ": no interval",
         "iqm": say(score_json["iqm"]),
         "range": span((min(score.returns), max(score.returns)), say),
         "reached": percent(score.solved_fraction),
@@ -322,7 +323,7 @@ def score_words(score: Evaluation) -> dict[str, Any]:
         "cut": score.cut,
         "binary": is_binary(score.returns),
         "solved": None if count is None else percent(count / n),
-        "solved_interval": None if count is None else span(wilson(count, n)),
+        "solved_interval": None if count is None or one else span(wilson(count, n)),
     }
 
 
