@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from html import escape
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,19 @@ Z = 1.96
 """Standard deviations of a 95 % interval."""
 NEIGHBORS = 5
 LEAST = 20
-"""The fewest calls from which something is concluded."""
+"""The fewest calls from which something is concluded in any case."""
+FEW = 5
+"""The fewest calls that are called weak, where they are clearly worse than the others."""
+CHANCE = 0.01
+"""The chance that any pair of a matrix is called weak where all are alike."""
+GOOD = 0.95
+"""A pair that is done at least this often is not weak."""
+DOUBTFUL = 0.1
+"""A pair with few calls may be weak where it is done so much less often than elsewhere."""
+SELDOM = 0.25
+"""A skill is seldom done where its rate is clearly below."""
+SHOWN = 4
+"""Pairs that a sentence names at most."""
 BEST = 1 / 3
 """The share of the first skill's ends that are compared with the others."""
 LIKE_ELSEWHERE = 0.1
@@ -55,6 +68,7 @@ class Handover:
         time_limit: the steps after which episodes are truncated; 0: none is seen.
         needed: (S + 1, S) int64, the steps of an episode in which half of the calls that began too
             late would have counted, 0: there were none; None: unknown.
+        steps: the logged steps; 0: unknown.
     """
 
     skills: tuple[str, ...]
@@ -64,6 +78,7 @@ class Handover:
     by_itself: tuple[str, ...] = ()
     time_limit: int = 0
     needed: Array | None = None
+    steps: int = 0
 
     @property
     def before(self) -> tuple[str, ...]:
@@ -96,14 +111,33 @@ class Handover:
         place = self.before.index(after), self.skills.index(skill)
         return float(self.rate[place]), int(self.calls[place])
 
-    def weakest(self, least: int = 20) -> list[str]:
-        """Return sentences on the skills that are never done, and on weak handovers.
+    def weakest(self, least: int = FEW) -> list[str]:
+        """Return sentences on the skills that are never done, on weak handovers, and on few calls.
 
-        A handover is weak where a skill is done much less often after one skill than elsewhere.
+        A handover is weak where a skill is done less often after one skill than elsewhere, and by
+        more than chance, though there are many pairs (Fisher's exact test). Pairs that may be weak,
+        but have too few calls to say so, are named, with the logged steps that it takes; and pairs
+        whose calls began too late to count.
 
         Args:
             least: the fewest calls that count.
         """
+        few = (self.calls > 0) & (self.calls < LEAST) & ~self._is_weak(least)
+        weak = [*self.weak_sentences(least), *self._seldom(least)]
+        return [*weak, *self._doubtful(few), *self._without_time()]
+
+    def _seldom(self, least: int) -> list[str]:
+        """Return a sentence on each skill that is seldom done, wherever it is called."""
+        calls, done = self.calls.sum(0), self.done.sum(0)
+        seldom = (calls >= least) & (done > 0) & (wilson(done, calls)[1] < SELDOM)
+        seldom &= ~np.isin(self.skills, self.by_itself)
+        return [
+            f"{self.skills[j]!r} succeeds in only {shown_rate(done[j], calls[j])} in all"
+            for j in np.flatnonzero(seldom)
+        ]
+
+    def weak_sentences(self, least: int = FEW) -> list[str]:
+        """Return the sentences of ``weakest`` on the places of ``weak``."""
         never, (calls, done) = self._never(least), self._elsewhere
         sentences = [
             f"{skill!r} succeeds in {shown_rate(0, count)}, whatever came before"
@@ -120,6 +154,56 @@ class Handover:
             sentences.append(f"{skill!r} {does} in {here} {where}; in {elsewhere} elsewhere")
         return sentences
 
+    def _doubtful(self, few: Array) -> list[str]:
+        """Return a sentence on the pairs ``few`` (S + 1, S) that may be weak, if there are any."""
+        calls, done = self._elsewhere
+        with np.errstate(invalid="ignore"):
+            worse = self.rate < done / np.where(calls > 0, calls, np.nan) - DOUBTFUL
+        if not (few & worse).any():
+            return []
+        pairs = self._pairs(
+            few & worse, lambda place: shown_rate(self.done[place], self.calls[place])
+        )
+        more = "record more calls"
+        if self.steps:
+            steps = rounded_up(self.steps * LEAST / int(self.calls[few & worse].min()))
+            more = f"with about {steps:,} logged steps, in place of {self.steps:,}, it has {LEAST}"
+        return [f"Too few calls to say whether a handover is weak: {pairs}; {more}"]
+
+    def _without_time(self) -> list[str]:
+        """Return a sentence on the pairs most of whose calls began too late; none if none is."""
+        place = (self.calls < LEAST) & (self.began_late > np.maximum(self.calls, 2))
+        if not place.any():
+            return []
+        pairs = self._pairs(place, lambda at: f"{self.calls[at]:,} of {self._all[at]:,} calls")
+        return [f"Too few calls begin early enough to count: {pairs}; {self._more_time(place)}"]
+
+    def _more_time(self, place: Array) -> str:
+        """Return words on what makes the calls of pairs ``place`` (S + 1, S) count."""
+        assert self.needed is not None
+        needed = int(np.median(self.needed[place]))
+        return (
+            f"that takes episodes of about {needed:,} steps, in place of {self.time_limit:,}, or "
+            "shorter calls (call_steps, max_steps)"
+        )
+
+    def _pairs(self, place: Array, words: Callable[[tuple[int, int]], str]) -> str:
+        """Return a list of the pairs ``place`` (S + 1, S) bool, with words on each."""
+        at = [(i, j) for j, i in np.argwhere(place.T).tolist()]
+        each = [
+            f"{self.skills[j]!r} {f'after {self.before[i]!r}' if i else 'at the start'} "
+            f"({words((i, j))})"
+            for i, j in at[:SHOWN]
+        ]
+        more = [f"{len(at) - SHOWN} more"] if len(at) > SHOWN else []
+        return ", ".join([*each, *more])
+
+    @property
+    def _all(self) -> Array:
+        """Calls of each pair, with those that began too late, (S + 1, S)."""
+        every: Array = self.calls + self.began_late
+        return every
+
     @property
     def _elsewhere(self) -> tuple[Array, Array]:
         """Calls of each skill in the other rows, and of these that were done, (S + 1, S) each."""
@@ -130,13 +214,22 @@ class Handover:
         never: Array = (self.calls.sum(0) >= least) & ~self.done.any(0)
         return never & ~np.isin(self.skills, self.by_itself)
 
-    def weak(self, least: int = 20) -> list[tuple[int, int]]:
-        """Return the places (row, column) that ``weakest`` is about."""
+    def _is_weak(self, least: int) -> Array:
+        """Return the places of ``weak`` as a mask, (S + 1, S) bool."""
         calls, done = self._elsewhere
-        weak = (self.calls >= least) & (calls >= least)
-        weak &= self.interval[1] < wilson(done, calls)[0]
-        weak |= self._never(least) & (self.calls > 0)
-        return [(i, j) for j, i in np.argwhere(weak.T).tolist()]
+        compared = (self.calls > 0) & (calls > 0)
+        worse = compared & (self.calls >= least) & (calls >= least) & (self.rate < GOOD)
+        weak = self._never(least) & (self.calls > 0)
+        for i, j in np.argwhere(worse & (self.rate * calls < done)).tolist():
+            chance = _chance_of_fewer(
+                int(self.done[i, j]), int(self.calls[i, j]), int(done[i, j]), int(calls[i, j])
+            )
+            weak[i, j] |= chance < CHANCE / int(compared.sum())
+        return weak
+
+    def weak(self, least: int = FEW) -> list[tuple[int, int]]:
+        """Return the places (row, column) of skills that are never done, and of weak handovers."""
+        return [(i, j) for j, i in np.argwhere(self._is_weak(least).T).tolist()]
 
     @property
     def meaning(self) -> str:
@@ -154,9 +247,11 @@ class Handover:
         late = int(self.began_late.sum())
         if not late:
             return ""
+        few = (self.calls < LEAST) & (self.began_late > np.maximum(self.calls, 2))
+        more = f". Some pairs have few calls left; {self._more_time(few)}" if few.any() else ""
         return (
             f"Left out, as they began too late to run their whole length before the episode's time "
-            f"limit of {self.time_limit:,} steps: {late:,} call{'s' * (late != 1)}."
+            f"limit of {self.time_limit:,} steps: {late:,} call{'s' * (late != 1)}{more}."
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -208,13 +303,19 @@ class Chain:
     """The factors of the product."""
     calls: tuple[int, ...]
     """The number of calls that each factor was counted from."""
+    interval: tuple[float, float]
+    """Of the estimate, 95 %, by the episodes whose calls count at the scarcest step."""
 
     def __str__(self) -> str:
         """Return the estimate and the product as a sentence."""
-        text = f"{' then '.join(self.skills)}: {self.estimate:.0%} along the logged calls; "
+        low, high = self.interval
+        text = (
+            f"{' then '.join(self.skills)}: {self.estimate:.0%} ({low:.0%} to {high:.0%}) along "
+            "the logged calls; "
+        )
         if 0 in self.calls:
             name = self.skills[self.calls.index(0)]
-            return f"{text}no product, as no logged call of {name!r} came right after"
+            return f"{text}no product, as no logged call of {name!r} came right after and counts"
         factors = " × ".join(
             f"{rate:.0%} of {calls:,}" for rate, calls in zip(self.rates, self.calls, strict=True)
         )
@@ -323,6 +424,64 @@ def wilson(successes: Any, trials: Any) -> tuple[Array, Array]:
     half = Z / (1 + Z * Z / safe) * np.sqrt(share * (1 - share) / safe + (Z / (2 * safe)) ** 2)
     low = np.where(n > 0, np.clip(middle - half, 0.0, 1.0), 0.0)
     return low, np.where(n > 0, np.clip(middle + half, 0.0, 1.0), 1.0)
+
+
+def _others(starts: Array, ends: Array, calls: Array, own: Array) -> tuple[Array, Array]:
+    """Return the nearest calls to ends, and their weights, (n, K) each.
+
+    The call that followed an end is left out: its outcome would be its own forecast.
+
+    Args:
+        starts: (m, F) of calls.
+        ends: (n, F).
+        calls: (m,) the calls' numbers.
+        own: (n,) the number of the call that followed each end; −1: none.
+    """
+    near, distance = nearest(starts, ends, NEIGHBORS + 1, calls)
+    is_own = (calls[near] == own[:, None]) & (np.isfinite(distance).sum(1) > 1)[:, None]
+    distance = np.where(is_own, np.inf, distance)
+    order = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBORS]
+    near, distance = (np.take_along_axis(x, order, 1) for x in (near, distance))
+    return near, weights_of(distance)
+
+
+def _bounds(estimate: float, share: Array, episode: Array) -> tuple[float, float]:
+    """Return a 95 % interval of a chance, as far as it follows from the calls of one step.
+
+    Calls of one episode are not independent, and few of them may count for most.
+
+    Args:
+        estimate: the chance of all steps.
+        share: (n,) of the chains that come by each call of the step.
+        episode: (n,) of each call.
+    """
+    reached = float(share.sum())
+    if not reached:
+        return 0.0, 1.0
+    by_episode = np.bincount(np.unique(episode, return_inverse=True)[1], share)
+    count = reached**2 / float(np.square(by_episode).sum())
+    low, high = wilson(estimate / reached * count, count)
+    return reached * float(low), reached * float(high)
+
+
+def _chance_of_fewer(done: int, calls: int, done_elsewhere: int, calls_elsewhere: int) -> float:
+    """Return the chance of at most ``done`` of ``calls``, if it is as elsewhere (Fisher 1934)."""
+    won, all_calls = done + done_elsewhere, calls + calls_elsewhere
+    logs = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, all_calls + 1)))])
+
+    def choose(n: int, k: Array) -> Array:
+        ways: Array = logs[n] - logs[k] - logs[n - k]
+        return ways
+
+    k = np.arange(max(0, calls - (all_calls - won)), done + 1)
+    ways = choose(won, k) + choose(all_calls - won, calls - k) - choose(all_calls, np.array(calls))
+    return float(np.exp(ways).sum())
+
+
+def rounded_up(number: float) -> int:
+    """Return a number with its first two digits, rounded up."""
+    unit = int(10 ** max(0, len(str(int(number))) - 2))
+    return int(-(-number // unit)) * unit
 
 
 def began_late_words(calls: int, time_limit: int, needed: int) -> str:
@@ -515,7 +674,8 @@ class LinkedCalls(CallColumns):
             rows = self.began_late & (before == i) & (self.skill == j)
             ends = self.age[rows] + self.whole_steps[self.choice[rows]]
             needed[i, j] = np.quantile(ends, 0.5, method="higher")
-        return Handover(self.skills, calls, did, late, by_itself, self.time_limit, needed)
+        limit, steps = self.time_limit, self.steps
+        return Handover(self.skills, calls, did, late, by_itself, limit, needed, steps)
 
     def _too_late(self, calls: Array) -> str:
         """Return words on calls (k,) that began too late; empty: there are none."""
@@ -562,31 +722,40 @@ class LinkedCalls(CallColumns):
                     + "; record more calls, chosen at random"
                 )
         maps = feature_maps(self, features, np.concatenate([self.start, self.end]))
-        # From the last skill back: the chance that the rest of the chain is done after each call.
-        chance = won[rows[-1]].astype(np.float64)
-        for i in reversed(range(len(skills) - 1)):
+        links = list[tuple[Array, Array]]()
+        for i, (some, following) in enumerate(pairwise(rows)):
             here = maps[numbers[i + 1]]
-            starts, ends = here(self.start[rows[i + 1]]), here(self.end[rows[i]])
-            near, distance = nearest(starts, ends, NEIGHBORS, rows[i + 1])
-            follows = (weights_of(distance) * chance[near]).sum(1)
-            may = self.may_follow[rows[i]].reshape(len(rows[i]), len(self.skills), -1)
-            goes_on = won[rows[i]] & ~self.terminated[rows[i]]
+            starts, ends = here(self.start[following]), here(self.end[some])
+            near, weights = _others(starts, ends, following, self.followed_by[some])
+            may = self.may_follow[some].reshape(len(some), len(self.skills), -1)
+            goes_on = won[some] & ~self.terminated[some]
             follows_on = goes_on & may[:, numbers[i + 1]].any(1)
             if goes_on.any() and not follows_on.any():
                 raise RunError(
                     f"{skills[i + 1]!r} may not start where any logged call of {skills[i]!r} was "
                     "done (its initiation() is False there), so this chain cannot be run"
                 )
-            chance = np.where(follows_on, follows, 0.0)
+            links.append((near, weights * follows_on[:, None]))
+        # Of each call the share of chains that come by it: at a start, then along the links.
+        shares = [np.full(len(rows[0]), 1 / len(rows[0]))]
+        for (near, weights), following in zip(links, rows[1:], strict=True):
+            passed = shares[-1][:, None] * weights
+            shares.append(np.bincount(near.ravel(), passed.ravel(), minlength=len(following)))
+        estimate = float(shares[-1] @ won[rows[-1]])
+        bounds = [
+            _bounds(estimate, share, self.episode[some])
+            for share, some in zip(shares, rows, strict=True)
+        ]
         matrix = self.handover(done)
         pairs = [matrix.of(b, a) for a, b in zip((START, *skills), skills, strict=False)]
         rates = tuple(rate for rate, _ in pairs)
         return Chain(
             tuple(skills),
-            float(chance.mean()),
+            estimate,
             float(np.prod(rates)),
             rates,
             tuple(count for _, count in pairs),
+            (min(low for low, _ in bounds), max(high for _, high in bounds)),
         )
 
     @checked_names

@@ -17,7 +17,7 @@ from skillweave.planning.columns import (
     time_limit_of,
     whole_steps,
 )
-from skillweave.planning.handover import Handover, pair_counts
+from skillweave.planning.handover import LEAST, Handover, pair_counts
 from skillweave.planning.recorder import Recorder
 from skillweave.policies.core import CallEnd
 from skillweave.schema import Count
@@ -188,7 +188,7 @@ def weak_handovers(calls: PlayedCalls) -> list[str]:
         late = _began_late(recorder, rows, limit)
         pairs = pair_counts(before, skill, won, len(names), follows & ~late)
         none = np.zeros_like(pairs[0])
-        sentences += Handover(names, *pairs, none, (), limit, none).weakest()
+        sentences += Handover(names, *pairs, none, time_limit=limit).weak_sentences(LEAST)
     return sentences
 
 
