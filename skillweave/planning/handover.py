@@ -40,6 +40,8 @@ GOOD = 0.95
 """A pair that is done at least this often is not weak."""
 DOUBTFUL = 0.1
 """A pair with few calls may be weak where it is done so much less often than elsewhere."""
+ALIKE = 0.02
+"""Ends are alike where no number has a larger deviation, relative to its range over the log."""
 SELDOM = 0.25
 """A skill is seldom done where its rate is clearly below."""
 SHOWN = 4
@@ -525,6 +527,12 @@ class Blame:
         means: its mean at the best ends, and at the others.
         reasons: how the calls that failed ended: own, limit, interrupted, episode.
         first: True if other ends of the first skill would do, so that it is to blame.
+        works: where the second skill is clearly more often done: the skill before ("start": none),
+            its calls that are done there, and all.
+        differs: the number of the flat observation, of those that the first skill changes, in which
+            the starts of these calls differ most from those after it, its mean there, and here;
+            None: they differ in none.
+        alike: True if all ends of the first skill are alike.
     """
 
     skill: str
@@ -539,6 +547,9 @@ class Blame:
     means: tuple[float, float]
     reasons: dict[str, int]
     first: bool
+    works: tuple[tuple[str, int, int], ...] = ()
+    differs: tuple[int, float, float] | None = None
+    alike: bool = False
 
     @property
     def fine(self) -> bool:
@@ -561,6 +572,8 @@ class Blame:
                 if count
             )
             parts.append(f"Of the calls that failed, {words}")
+            if self.reasons.get("limit") == failed:
+                parts.append("So they may need more steps (call_steps, max_steps)")
         if self.fine:
             parts.append("That is no worse than elsewhere, so neither skill is to blame")
         elif self.after == START:
@@ -570,19 +583,52 @@ class Blame:
                 f"These are too few calls to say which skill is to blame (at least {LEAST})"
             )
         else:
-            third = _third(self.calls)
-            best = shown_rate(self.best * third, third)
-            worse = shown_rate(self.others * (self.calls - third), self.calls - third)
-            parts.append(
-                f"{self.after!r} is to blame for where it ends: from the best third of its ends "
-                f"{self.skill!r} is done in {best}, from the others in {worse}"
-                f"{self._difference()}"
-                if self.first
-                else f"It would not help if {self.after!r} ended elsewhere: "
-                f"from the best third of its ends {self.skill!r} is done in {best}. So "
-                f"{self.skill!r} itself has to work from there"
-            )
+            parts.append(self._verdict())
+        if not self.fine and not self.first and self.works:
+            parts.append(self._elsewhere())
         return ". ".join(parts) + "."
+
+    def _verdict(self) -> str:
+        """Return words on which of the two skills is to blame."""
+        third = _third(self.calls)
+        best = shown_rate(self.best * third, third)
+        worse = shown_rate(self.others * (self.calls - third), self.calls - third)
+        if self.first:
+            return (
+                f"{self.after!r} is to blame for where it ends: from the best third of its ends "
+                f"{self.skill!r} is done in {best}, from the others in {worse}{self._difference()}"
+            )
+        if self.alike:
+            ends = (
+                f"All ends of {self.after!r} are alike, so they do not say whether others would do"
+            )
+        else:
+            ends = f"From the best third of the ends of {self.after!r} it is done in {best}"
+        if self.works:
+            return ends
+        return f"{ends}. So {self.skill!r} itself has to work from there"
+
+    def _elsewhere(self) -> str:
+        """Return words on where the second skill works, and how these starts differ."""
+        where = ", ".join(
+            f"{'at the start of an episode' if name == START else f'after {name!r}'} "
+            f"({shown_rate(done, calls)})"
+            for name, done, calls in self.works[:SHOWN]
+        )
+        text = f"{self.skill!r} works {where}"
+        if self.differs is not None:
+            place, there, here = self.differs
+            text += (
+                f", where number {place} of the observation is {there:.2g} at the start of its "
+                f"calls, and {here:.2g} here"
+            )
+        if self.after == START:
+            return f"{text}; it has to learn to start here, too"
+        ends = "" if self.differs is None else f"{self.after!r} has to end as these do, "
+        return (
+            f"{text}. So {ends}another skill has to come in between, or {self.skill!r} has to "
+            f"learn to start where {self.after!r} ends"
+        )
 
     def _difference(self) -> str:
         if self.place is None:
@@ -624,7 +670,13 @@ def _predicted(at: Array, won: Array, known: Array, rows: Array) -> Array:
 def _largest_difference(
     vector: Array, best: Array, changes: Array
 ) -> tuple[int | None, tuple[float, float]]:
-    """Return the number that differs most between two groups of ends, of those that change."""
+    """Return the number that differs most between two groups of starts, of those that change.
+
+    Args:
+        vector: (n, F) of the starts.
+        best: (n,) bool, those of the first group.
+        changes: (F,) bool, the numbers that count.
+    """
     if not changes.any():
         return None, (float("nan"), float("nan"))
     one, other = vector[best].mean(0), vector[~best].mean(0)
@@ -796,7 +848,7 @@ class LinkedCalls(CallColumns):
         Each call of the second skill after the first is predicted by the nearest other ones. If
         the third of the first skill's ends with the best predictions serve about as well as other
         starts do, and the other ends clearly worse, then the first skill is to blame for how it
-        ends; else the second has never learnt to start there.
+        ends. Else the second one has not learnt to start there; where it works is named.
 
         Args:
             skill: the second skill.
@@ -825,16 +877,22 @@ class LinkedCalls(CallColumns):
         nan, did = float("nan"), won[rows]
         elsewhere = float(won[others].mean()) if len(others) else nan
         reasons, rate = self.take(rows[~did]).reasons, float(did.mean())
+        starts = self.flat(self.start)
+        changes = np.ones(starts.shape[1], bool)
+        if after != START:
+            of_first = self.skill[self.owner] == self.number(after)
+            changes = (self.flat(self.before[of_first]) != self.flat(self.next_obs[of_first])).any(
+                0
+            )
+        works, differs = self._works(won, before, number, rows, starts, changes)
         unknown = Blame(
             skill, after, rate, elsewhere, len(rows), len(others), nan, nan, None, (nan, nan),
-            reasons, False,
+            reasons, False, works, differs,
         )  # fmt: skip
         if after == START or len(rows) < LEAST:
             return unknown
         maps = feature_maps(self, features, self.start)
         known = np.flatnonzero(counts & ~self.began_late)
-        starts, of_first = self.flat(self.start), self.skill[self.owner] == self.number(after)
-        changes = (self.flat(self.before[of_first]) != self.flat(self.next_obs[of_first])).any(0)
         # Where a number that the first skill does not change decides, none of its ends is better.
         score = _predicted(maps[number](self.start), won, known, rows)
         score = score - _predicted(
@@ -848,4 +906,52 @@ class LinkedCalls(CallColumns):
         _, high = wilson(did[~best].sum(), (~best).sum())
         first = good >= as_elsewhere - LIKE_ELSEWHERE and good - bad >= WORSE and low > high
         place, means = _largest_difference(starts[rows], best, changes)
-        return replace(unknown, best=good, others=bad, place=place, means=means, first=bool(first))
+        low, high = np.quantile(starts[:, changes], (0.05, 0.95), axis=0)
+        alike = starts[rows][:, changes].std(0) <= ALIKE * (high - low)
+        return replace(
+            unknown,
+            best=good,
+            others=bad,
+            place=place,
+            means=means,
+            first=bool(first),
+            alike=bool(changes.any() and alike.all()),
+        )
+
+    def _works(
+        self,
+        won: Array,
+        before: Array,
+        number: int,
+        rows: Array,
+        starts: Array,
+        changes: Array,
+    ) -> tuple[tuple[tuple[str, int, int], ...], tuple[int, float, float] | None]:
+        """Return ``works`` and ``differs`` of a ``Blame``.
+
+        Args:
+            won: (C,) bool, the calls that were done.
+            before: (C,) of ``before_each``.
+            number: of the skill.
+            rows: (n,) its calls that it is to explain.
+            starts: (C, F) flat observations at the starts of all calls.
+            changes: (F,) bool, the numbers that the first skill changes.
+        """
+        high = wilson(won[rows].sum(), len(rows))[1]
+        works, there = list[tuple[str, int, int]](), list[Array]()
+        for row in np.unique(before[(before >= 0) & (self.skill == number)]).tolist():
+            some = np.flatnonzero((before == row) & (self.skill == number))
+            done = won[some].sum()
+            if wilson(done, len(some))[0] > high:
+                works.append(((START, *self.skills)[row], int(done), len(some)))
+                there.append(some[won[some]])
+        works.sort(key=lambda entry: -entry[1] / entry[2])
+        if not works:
+            return (), None
+        both = np.concatenate([*there, rows])
+        place, (one, other) = _largest_difference(
+            starts[both], np.arange(len(both)) < len(both) - len(rows), changes
+        )
+        if place is None or np.isclose(one, other):
+            return tuple(works), None
+        return tuple(works), (place, one, other)
