@@ -113,6 +113,18 @@ class Handover:
         place = self.before.index(after), self.skills.index(skill)
         return float(self.rate[place]), int(self.calls[place])
 
+    def time_words(self, skill: str, after: str) -> str:
+        """Return words on the calls of a pair that began too late to count; empty: few did."""
+        place = np.zeros(self.calls.shape, bool)
+        place[self.before.index(after), self.skills.index(skill)] = True
+        late = place & self._lacks_time
+        if not late.any():
+            return ""
+        return (
+            f"{int(self.began_late[late].sum()):,} of {int(self._all[late].sum()):,} calls began "
+            f"too late to run their whole length; {self._more_time(late)}"
+        )
+
     def weakest(self, least: int = FEW) -> list[str]:
         """Return sentences on the skills that are never done, on weak handovers, and on few calls.
 
@@ -174,7 +186,7 @@ class Handover:
 
     def _without_time(self) -> list[str]:
         """Return a sentence on the pairs most of whose calls began too late; none if none is."""
-        place = (self.calls < LEAST) & (self.began_late > np.maximum(self.calls, 2))
+        place = self._lacks_time
         if not place.any():
             return []
         pairs = self._pairs(place, lambda at: f"{self.calls[at]:,} of {self._all[at]:,} calls")
@@ -199,6 +211,12 @@ class Handover:
         ]
         more = [f"{len(at) - SHOWN} more"] if len(at) > SHOWN else []
         return ", ".join([*each, *more])
+
+    @property
+    def _lacks_time(self) -> Array:
+        """The pairs with few calls, as most began too late, (S + 1, S) bool."""
+        lacks: Array = (self.calls < LEAST) & (self.began_late > np.maximum(self.calls, 2))
+        return lacks
 
     @property
     def _all(self) -> Array:
@@ -249,7 +267,7 @@ class Handover:
         late = int(self.began_late.sum())
         if not late:
             return ""
-        few = (self.calls < LEAST) & (self.began_late > np.maximum(self.calls, 2))
+        few = self._lacks_time
         more = f". Some pairs have few calls left; {self._more_time(few)}" if few.any() else ""
         return (
             f"Left out, as they began too late to run their whole length before the episode's time "
@@ -486,21 +504,6 @@ def rounded_up(number: float) -> int:
     return int(-(-number // unit)) * unit
 
 
-def began_late_words(calls: int, time_limit: int, needed: int) -> str:
-    """Return words on calls that are left out, as they began too late.
-
-    Args:
-        calls: how many.
-        time_limit: the steps after which episodes are truncated.
-        needed: the steps of an episode in which half of them would have counted.
-    """
-    return (
-        f"{calls:,} began too late to run their whole length before the episode's time limit of "
-        f"{time_limit:,} steps; that takes episodes of about {needed:,} steps, or shorter calls "
-        "(call_steps, max_steps)"
-    )
-
-
 def shown_rate(done: float, calls: float, what: str = " calls") -> str:
     """Return a share with its count and its 95 % interval, in words."""
     low, high = wilson(done, calls)
@@ -735,8 +738,10 @@ class LinkedCalls(CallColumns):
         if not len(late):
             return ""
         needed = self.age[late] + self.whole_steps[self.choice[late]]
-        return ": " + began_late_words(
-            len(late), self.time_limit, int(np.quantile(needed, 0.5, method="higher"))
+        return (
+            f": {len(late):,} began too late to run their whole length before the episode's time "
+            f"limit of {self.time_limit:,} steps; that takes episodes of about "
+            f"{int(np.median(needed)):,} steps, or shorter calls (call_steps, max_steps)"
         )
 
     @checked_names
