@@ -6,6 +6,7 @@ The three classes refer to one another, so they are one module.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -373,7 +374,7 @@ class TrainedPolicy:
             )
         if save:
             save_evaluation(RunDirectory.open(self.path), score, seed, deterministic)
-        return score
+        return score.comparing(self.hierarchy.features) if log_calls else score
 
     @checked_names
     def render(
@@ -559,7 +560,8 @@ class TrainedPolicy:
         spec = self._own_spec()
         seed, info = self._calls.begin(self.policy, seed, info)
         how: dict[str, Any] = {"own_rewards": False, "keep": self._calls.add}
-        return with_returns(spec, self.policy, steps, choose, num_envs, seed, info, **how)[0]
+        log, _ = with_returns(spec, self.policy, steps, choose, num_envs, seed, info, **how)
+        return replace(log, features=self.hierarchy.features)
 
     @property
     def calls(self) -> CallLog:
@@ -569,8 +571,8 @@ class TrainedPolicy:
             DeclarationError: this is the run of a plain agent.
             RunError: none were recorded, or their file is damaged or of other skills.
         """
-        _ = self.hierarchy
-        return self._calls.read(self.policy, self._own_spec())
+        features = self.hierarchy.features
+        return replace(self._calls.read(self.policy, self._own_spec()), features=features)
 
     @property
     def has_calls(self) -> bool:

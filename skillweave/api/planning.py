@@ -160,7 +160,11 @@ def mission_words(declared: Declaration, given: Mapping[str, Any]) -> dict[str, 
 
 
 def lacking_features(declared: Declaration, policy: Policy) -> str:
-    """Return a sentence if skills see images, which plans cannot compare; it may be empty."""
+    """Return a sentence if skills see images, which plans cannot compare; it may be empty.
+
+    Args:
+        policy: with the skills, of the whole hierarchy or of one level.
+    """
     skills = skills_below(policy)
     if skills is None or declared.features is not None or None not in seen_places(skills):
         return ""

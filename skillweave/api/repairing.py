@@ -12,6 +12,7 @@ from skillweave._internal.paths import join, level_of, name_of
 from skillweave.algorithms.config import OnPolicy, config_to_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.applying import Trained, apply_manifest
+from skillweave.api.planning import lacking_features
 from skillweave.api.running import begin, go_on
 from skillweave.api.train_options import RepairOptions
 from skillweave.errors import DeclarationError, RunError
@@ -84,8 +85,11 @@ def repair(
             "steps"
         )
     with Progress(quiet=options.quiet) as progress:
-        found = _measured(roles, policy, skill, after, done, calls, config.num_envs, progress)
-    reason = str(found.log.blame(name_of(skill), name_of(after), done))
+        found = _measured(
+            declared, roles, policy, skill, after, done, calls, config.num_envs, progress
+        )
+    log = replace(found.log, features=declared.features)
+    reason = str(log.blame(name_of(skill), name_of(after), done))
     reason += f" {found.shortage}" if found.shortage else ""
     before = matrix_to_json(found.matrix)
     known = sorted(done or ())
@@ -172,6 +176,7 @@ def _checked(roles: Roles, skill: Any, after: Any) -> tuple[str, str]:
 
 
 def _measured(
+    declared: Declaration,
     roles: Roles,
     policy: HierarchyPolicy,
     skill: str,
@@ -184,26 +189,30 @@ def _measured(
     """Measure the handover as it is.
 
     Raises:
-        DeclarationError: there is nothing to repair, or the skill may not start there.
+        DeclarationError: there is nothing to repair, or the skill may not start there, or images
+            need features.
     """
     level = parts_of(roles, policy)[level_of(skill)]
     assert isinstance(level, HierarchyPolicy)
+    if words := lacking_features(declared, level):
+        raise DeclarationError(words)
     names = name_of(skill), name_of(after)
     found = measure(roles.spec, level.skills, *names, done, calls, num_envs, progress.message)
     rate, count = found.matrix.of(*names)
+    late = found.matrix.time_words(*names)
     if not count:
-        why = "no call of it was done, or the episode ended with it"
-        if not found.may_start:
+        why = late or "no call of it was done, or the episode ended with it"
+        if not found.may_start and not late:
             why = f"the initiation() of {skill!r} was False wherever {after!r} ended"
         raise DeclarationError(
             f"{skill!r} was never called after {after!r}: {why}, so there is nothing to repair it "
             f"from. {found.shortage}"
         )
+    often = f"let {after!r} be done more often first"
     if count < min(calls, FEWEST):
         raise DeclarationError(
             f"{skill!r} was called only {count} times after a call of {after!r} that was done, too "
-            f"few to see whether a repair is better: let {after!r} be done more often first. "
-            f"{found.shortage}"
+            f"few to see whether a repair is better: {late or often}. {found.shortage}"
         )
     if rate >= GOOD:
         raise DeclarationError(

@@ -281,7 +281,8 @@ def measure(
 
 
 def _sum(one: Handover, other: Handover) -> Handover:
-    counts = {k: getattr(one, k) + getattr(other, k) for k in ("calls", "done", "began_late")}
+    added = ("calls", "done", "began_late", "steps")
+    counts = {k: getattr(one, k) + getattr(other, k) for k in added}
     limit = max(one.time_limit, other.time_limit)
     assert one.needed is not None
     assert other.needed is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from skillweave.runs.user_code import (
 )
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import without_goal
+from skillweave.skills.own_part import OwnPart
 from skillweave.skills.skill_set import SkillSet
 from skillweave.spaces import obs_codec, same_space
 
@@ -67,6 +69,8 @@ class CallLog(LinkedCalls):
         code: texts of the environment and the skills, to be compared later.
         limits: of each skill, the most steps of a call; None: it has no limit. (): unknown.
         known_time_limit: ``time_limit`` of the log that these calls were taken from; None: of none.
+        features: by what calls are compared where no others are given: the ``Hierarchy``'s, in the
+            logs of its runs. Files do not have them.
     """
 
     def check_skills(self, skills: SkillSet, *, learning: bool = False) -> None:
@@ -236,14 +240,16 @@ def skill_code(skills: SkillSet) -> Texts:
 def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:
     """Return the places of the environment's observation that each skill's network sees.
 
-    None: all, or the policy is no network, or the skill sees its own part of observations, or
-    corrects a policy, which sees all.
+    None: all, or the policy is no network, or the skill corrects a policy, which sees all, or sees
+    its own part of observations; of one that has images, the part's places if it has none.
     """
     found: list[tuple[int, ...] | None] = []
     for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True)):
         part, places = skills.part(i), getattr(policy, "seen_places", None)
-        sees_else = part is not None and (part.part.inputs is not None or part.base is not None)
-        if places is None or sees_else:
+        if part is not None and (part.part.inputs is not None or part.base is not None):
+            found.append(None if part.base is not None else _places_of_part(part))
+            continue
+        if places is None:
             found.append(None)
             continue
         if skill.goal_space is not None:  # goals come after the observation
@@ -251,6 +257,29 @@ def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:
             places = tuple(place for place in places if place < size)
         found.append(places or None)
     return tuple(found)
+
+
+def _places_of_part(part: OwnPart) -> tuple[int, ...] | None:
+    """Return the places in the flat observation that a skill's own part has.
+
+    None: there are no images, which would have no places; or it has one, or what a function makes.
+    """
+    codec = obs_codec(part.whole_observation_space)
+    if not codec.images:
+        return None
+    leaves, first = dict[str, range](), 0
+    for leaf in codec.leaves:
+        if leaf.image is None:
+            leaves[leaf.name] = range(first, first + leaf.size)
+            first += leaf.size
+    places = set[int]()
+    for take in (take for one in (part.part.inputs or {}).values() for take in one.takes):
+        own = leaves.get(".".join(take.fields)) if take.source == "observation" else None
+        if own is None:
+            return None
+        one_hot = bool(take.choices) == (len(own) != prod(take.shape))
+        places |= {own[i] for i in take.places} if take.places and one_hot else set(own)
+    return tuple(sorted(places)) or None
 
 
 def _shown_lengths(lengths: Sequence[int]) -> str:

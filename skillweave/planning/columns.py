@@ -91,6 +91,7 @@ class CallColumns(Choices):
     code: Texts = field(default_factory=dict)
     limits: tuple[int | None, ...] = ()
     known_time_limit: int | None = None
+    features: Any = None
 
     def __len__(self) -> int:
         return len(self.choice)

@@ -81,11 +81,12 @@ def feature_maps(
 
     Args:
         log: the calls.
-        features: for all skills, or by skill; None: the ``compared_places``.
+        features: for all skills, or by skill; None: the log's own, else the ``compared_places``.
         known: logged observations.
         task: see ``compared_places``.
     """
     places, names = compared_places(log, task), log.skills
+    features = log.features if features is None else features
     by_skill = features if isinstance(features, Mapping) else dict.fromkeys(names, features)
     for name in by_skill:
         if name not in names:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from html import escape
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,21 @@ Z = 1.96
 """Standard deviations of a 95 % interval."""
 NEIGHBORS = 5
 LEAST = 20
-"""The fewest calls from which something is concluded."""
+"""The fewest calls from which something is concluded in any case."""
+FEW = 5
+"""The fewest calls that are called weak, where they are clearly worse than the others."""
+CHANCE = 0.01
+"""The chance that any pair of a matrix is called weak where all are alike."""
+GOOD = 0.95
+"""A pair that is done at least this often is not weak."""
+DOUBTFUL = 0.1
+"""A pair with few calls may be weak where it is done so much less often than elsewhere."""
+ALIKE = 0.02
+"""Ends are alike where no number has a larger deviation, relative to its range over the log."""
+SELDOM = 0.25
+"""A skill is seldom done where its rate is clearly below."""
+SHOWN = 4
+"""Pairs that a sentence names at most."""
 BEST = 1 / 3
 """The share of the first skill's ends that are compared with the others."""
 LIKE_ELSEWHERE = 0.1
@@ -55,6 +70,7 @@ class Handover:
         time_limit: the steps after which episodes are truncated; 0: none is seen.
         needed: (S + 1, S) int64, the steps of an episode in which half of the calls that began too
             late would have counted, 0: there were none; None: unknown.
+        steps: the logged steps; 0: unknown.
     """
 
     skills: tuple[str, ...]
@@ -64,6 +80,7 @@ class Handover:
     by_itself: tuple[str, ...] = ()
     time_limit: int = 0
     needed: Array | None = None
+    steps: int = 0
 
     @property
     def before(self) -> tuple[str, ...]:
@@ -96,14 +113,45 @@ class Handover:
         place = self.before.index(after), self.skills.index(skill)
         return float(self.rate[place]), int(self.calls[place])
 
-    def weakest(self, least: int = 20) -> list[str]:
-        """Return sentences on the skills that are never done, and on weak handovers.
+    def time_words(self, skill: str, after: str) -> str:
+        """Return words on the calls of a pair that began too late to count; empty: few did."""
+        place = np.zeros(self.calls.shape, bool)
+        place[self.before.index(after), self.skills.index(skill)] = True
+        late = place & self._lacks_time
+        if not late.any():
+            return ""
+        return (
+            f"{int(self.began_late[late].sum()):,} of {int(self._all[late].sum()):,} calls began "
+            f"too late to run their whole length; {self._more_time(late)}"
+        )
 
-        A handover is weak where a skill is done much less often after one skill than elsewhere.
+    def weakest(self, least: int = FEW) -> list[str]:
+        """Return sentences on the skills that are never done, on weak handovers, and on few calls.
+
+        A handover is weak where a skill is done less often after one skill than elsewhere, and by
+        more than chance, though there are many pairs (Fisher's exact test). Pairs that may be weak,
+        but have too few calls to say so, are named, with the logged steps that it takes; and pairs
+        whose calls began too late to count.
 
         Args:
             least: the fewest calls that count.
         """
+        few = (self.calls > 0) & (self.calls < LEAST) & ~self._is_weak(least)
+        weak = [*self.weak_sentences(least), *self._seldom(least)]
+        return [*weak, *self._doubtful(few), *self._without_time()]
+
+    def _seldom(self, least: int) -> list[str]:
+        """Return a sentence on each skill that is seldom done, wherever it is called."""
+        calls, done = self.calls.sum(0), self.done.sum(0)
+        seldom = (calls >= least) & (done > 0) & (wilson(done, calls)[1] < SELDOM)
+        seldom &= ~np.isin(self.skills, self.by_itself)
+        return [
+            f"{self.skills[j]!r} succeeds in only {shown_rate(done[j], calls[j])} in all"
+            for j in np.flatnonzero(seldom)
+        ]
+
+    def weak_sentences(self, least: int = FEW) -> list[str]:
+        """Return the sentences of ``weakest`` on the places of ``weak``."""
         never, (calls, done) = self._never(least), self._elsewhere
         sentences = [
             f"{skill!r} succeeds in {shown_rate(0, count)}, whatever came before"
@@ -120,6 +168,62 @@ class Handover:
             sentences.append(f"{skill!r} {does} in {here} {where}; in {elsewhere} elsewhere")
         return sentences
 
+    def _doubtful(self, few: Array) -> list[str]:
+        """Return a sentence on the pairs ``few`` (S + 1, S) that may be weak, if there are any."""
+        calls, done = self._elsewhere
+        with np.errstate(invalid="ignore"):
+            worse = self.rate < done / np.where(calls > 0, calls, np.nan) - DOUBTFUL
+        if not (few & worse).any():
+            return []
+        pairs = self._pairs(
+            few & worse, lambda place: shown_rate(self.done[place], self.calls[place])
+        )
+        more = "record more calls"
+        if self.steps:
+            steps = rounded_up(self.steps * LEAST / int(self.calls[few & worse].min()))
+            more = f"with about {steps:,} logged steps, in place of {self.steps:,}, it has {LEAST}"
+        return [f"Too few calls to say whether a handover is weak: {pairs}; {more}"]
+
+    def _without_time(self) -> list[str]:
+        """Return a sentence on the pairs most of whose calls began too late; none if none is."""
+        place = self._lacks_time
+        if not place.any():
+            return []
+        pairs = self._pairs(place, lambda at: f"{self.calls[at]:,} of {self._all[at]:,} calls")
+        return [f"Too few calls begin early enough to count: {pairs}; {self._more_time(place)}"]
+
+    def _more_time(self, place: Array) -> str:
+        """Return words on what makes the calls of pairs ``place`` (S + 1, S) count."""
+        assert self.needed is not None
+        needed = int(np.median(self.needed[place]))
+        return (
+            f"that takes episodes of about {needed:,} steps, in place of {self.time_limit:,}, or "
+            "shorter calls (call_steps, max_steps)"
+        )
+
+    def _pairs(self, place: Array, words: Callable[[tuple[int, int]], str]) -> str:
+        """Return a list of the pairs ``place`` (S + 1, S) bool, with words on each."""
+        at = [(i, j) for j, i in np.argwhere(place.T).tolist()]
+        each = [
+            f"{self.skills[j]!r} {f'after {self.before[i]!r}' if i else 'at the start'} "
+            f"({words((i, j))})"
+            for i, j in at[:SHOWN]
+        ]
+        more = [f"{len(at) - SHOWN} more"] if len(at) > SHOWN else []
+        return ", ".join([*each, *more])
+
+    @property
+    def _lacks_time(self) -> Array:
+        """The pairs with few calls, as most began too late, (S + 1, S) bool."""
+        lacks: Array = (self.calls < LEAST) & (self.began_late > np.maximum(self.calls, 2))
+        return lacks
+
+    @property
+    def _all(self) -> Array:
+        """Calls of each pair, with those that began too late, (S + 1, S)."""
+        every: Array = self.calls + self.began_late
+        return every
+
     @property
     def _elsewhere(self) -> tuple[Array, Array]:
         """Calls of each skill in the other rows, and of these that were done, (S + 1, S) each."""
@@ -130,13 +234,22 @@ class Handover:
         never: Array = (self.calls.sum(0) >= least) & ~self.done.any(0)
         return never & ~np.isin(self.skills, self.by_itself)
 
-    def weak(self, least: int = 20) -> list[tuple[int, int]]:
-        """Return the places (row, column) that ``weakest`` is about."""
+    def _is_weak(self, least: int) -> Array:
+        """Return the places of ``weak`` as a mask, (S + 1, S) bool."""
         calls, done = self._elsewhere
-        weak = (self.calls >= least) & (calls >= least)
-        weak &= self.interval[1] < wilson(done, calls)[0]
-        weak |= self._never(least) & (self.calls > 0)
-        return [(i, j) for j, i in np.argwhere(weak.T).tolist()]
+        compared = (self.calls > 0) & (calls > 0)
+        worse = compared & (self.calls >= least) & (calls >= least) & (self.rate < GOOD)
+        weak = self._never(least) & (self.calls > 0)
+        for i, j in np.argwhere(worse & (self.rate * calls < done)).tolist():
+            chance = _chance_of_fewer(
+                int(self.done[i, j]), int(self.calls[i, j]), int(done[i, j]), int(calls[i, j])
+            )
+            weak[i, j] |= chance < CHANCE / int(compared.sum())
+        return weak
+
+    def weak(self, least: int = FEW) -> list[tuple[int, int]]:
+        """Return the places (row, column) of skills that are never done, and of weak handovers."""
+        return [(i, j) for j, i in np.argwhere(self._is_weak(least).T).tolist()]
 
     @property
     def meaning(self) -> str:
@@ -154,9 +267,11 @@ class Handover:
         late = int(self.began_late.sum())
         if not late:
             return ""
+        few = self._lacks_time
+        more = f". Some pairs have few calls left; {self._more_time(few)}" if few.any() else ""
         return (
             f"Left out, as they began too late to run their whole length before the episode's time "
-            f"limit of {self.time_limit:,} steps: {late:,} call{'s' * (late != 1)}."
+            f"limit of {self.time_limit:,} steps: {late:,} call{'s' * (late != 1)}{more}."
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -208,13 +323,19 @@ class Chain:
     """The factors of the product."""
     calls: tuple[int, ...]
     """The number of calls that each factor was counted from."""
+    interval: tuple[float, float]
+    """Of the estimate, 95 %, by the episodes whose calls count at the scarcest step."""
 
     def __str__(self) -> str:
         """Return the estimate and the product as a sentence."""
-        text = f"{' then '.join(self.skills)}: {self.estimate:.0%} along the logged calls; "
+        low, high = self.interval
+        text = (
+            f"{' then '.join(self.skills)}: {self.estimate:.0%} ({low:.0%} to {high:.0%}) along "
+            "the logged calls; "
+        )
         if 0 in self.calls:
             name = self.skills[self.calls.index(0)]
-            return f"{text}no product, as no logged call of {name!r} came right after"
+            return f"{text}no product, as no logged call of {name!r} came right after and counts"
         factors = " × ".join(
             f"{rate:.0%} of {calls:,}" for rate, calls in zip(self.rates, self.calls, strict=True)
         )
@@ -325,19 +446,62 @@ def wilson(successes: Any, trials: Any) -> tuple[Array, Array]:
     return low, np.where(n > 0, np.clip(middle + half, 0.0, 1.0), 1.0)
 
 
-def began_late_words(calls: int, time_limit: int, needed: int) -> str:
-    """Return words on calls that are left out, as they began too late.
+def _others(starts: Array, ends: Array, calls: Array, own: Array) -> tuple[Array, Array]:
+    """Return the nearest calls to ends, and their weights, (n, K) each.
+
+    The call that followed an end is left out: its outcome would be its own forecast.
 
     Args:
-        calls: how many.
-        time_limit: the steps after which episodes are truncated.
-        needed: the steps of an episode in which half of them would have counted.
+        starts: (m, F) of calls.
+        ends: (n, F).
+        calls: (m,) the calls' numbers.
+        own: (n,) the number of the call that followed each end; −1: none.
     """
-    return (
-        f"{calls:,} began too late to run their whole length before the episode's time limit of "
-        f"{time_limit:,} steps; that takes episodes of about {needed:,} steps, or shorter calls "
-        "(call_steps, max_steps)"
-    )
+    near, distance = nearest(starts, ends, NEIGHBORS + 1, calls)
+    is_own = (calls[near] == own[:, None]) & (np.isfinite(distance).sum(1) > 1)[:, None]
+    distance = np.where(is_own, np.inf, distance)
+    order = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBORS]
+    near, distance = (np.take_along_axis(x, order, 1) for x in (near, distance))
+    return near, weights_of(distance)
+
+
+def _bounds(estimate: float, share: Array, episode: Array) -> tuple[float, float]:
+    """Return a 95 % interval of a chance, as far as it follows from the calls of one step.
+
+    Calls of one episode are not independent, and few of them may count for most.
+
+    Args:
+        estimate: the chance of all steps.
+        share: (n,) of the chains that come by each call of the step.
+        episode: (n,) of each call.
+    """
+    reached = float(share.sum())
+    if not reached:
+        return 0.0, 1.0
+    by_episode = np.bincount(np.unique(episode, return_inverse=True)[1], share)
+    count = reached**2 / float(np.square(by_episode).sum())
+    low, high = wilson(estimate / reached * count, count)
+    return reached * float(low), reached * float(high)
+
+
+def _chance_of_fewer(done: int, calls: int, done_elsewhere: int, calls_elsewhere: int) -> float:
+    """Return the chance of at most ``done`` of ``calls``, if it is as elsewhere (Fisher 1934)."""
+    won, all_calls = done + done_elsewhere, calls + calls_elsewhere
+    logs = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, all_calls + 1)))])
+
+    def choose(n: int, k: Array) -> Array:
+        ways: Array = logs[n] - logs[k] - logs[n - k]
+        return ways
+
+    k = np.arange(max(0, calls - (all_calls - won)), done + 1)
+    ways = choose(won, k) + choose(all_calls - won, calls - k) - choose(all_calls, np.array(calls))
+    return float(np.exp(ways).sum())
+
+
+def rounded_up(number: float) -> int:
+    """Return a number with its first two digits, rounded up."""
+    unit = int(10 ** max(0, len(str(int(number))) - 2))
+    return int(-(-number // unit)) * unit
 
 
 def shown_rate(done: float, calls: float, what: str = " calls") -> str:
@@ -366,6 +530,12 @@ class Blame:
         means: its mean at the best ends, and at the others.
         reasons: how the calls that failed ended: own, limit, interrupted, episode.
         first: True if other ends of the first skill would do, so that it is to blame.
+        works: where the second skill is clearly more often done: the skill before ("start": none),
+            its calls that are done there, and all.
+        differs: the number of the flat observation, of those that the first skill changes, in which
+            the starts of these calls differ most from those after it, its mean there, and here;
+            None: they differ in none.
+        alike: True if all ends of the first skill are alike.
     """
 
     skill: str
@@ -380,6 +550,9 @@ class Blame:
     means: tuple[float, float]
     reasons: dict[str, int]
     first: bool
+    works: tuple[tuple[str, int, int], ...] = ()
+    differs: tuple[int, float, float] | None = None
+    alike: bool = False
 
     @property
     def fine(self) -> bool:
@@ -402,6 +575,8 @@ class Blame:
                 if count
             )
             parts.append(f"Of the calls that failed, {words}")
+            if self.reasons.get("limit") == failed:
+                parts.append("So they may need more steps (call_steps, max_steps)")
         if self.fine:
             parts.append("That is no worse than elsewhere, so neither skill is to blame")
         elif self.after == START:
@@ -411,19 +586,52 @@ class Blame:
                 f"These are too few calls to say which skill is to blame (at least {LEAST})"
             )
         else:
-            third = _third(self.calls)
-            best = shown_rate(self.best * third, third)
-            worse = shown_rate(self.others * (self.calls - third), self.calls - third)
-            parts.append(
-                f"{self.after!r} is to blame for where it ends: from the best third of its ends "
-                f"{self.skill!r} is done in {best}, from the others in {worse}"
-                f"{self._difference()}"
-                if self.first
-                else f"It would not help if {self.after!r} ended elsewhere: "
-                f"from the best third of its ends {self.skill!r} is done in {best}. So "
-                f"{self.skill!r} itself has to work from there"
-            )
+            parts.append(self._verdict())
+        if not self.fine and not self.first and self.works:
+            parts.append(self._elsewhere())
         return ". ".join(parts) + "."
+
+    def _verdict(self) -> str:
+        """Return words on which of the two skills is to blame."""
+        third = _third(self.calls)
+        best = shown_rate(self.best * third, third)
+        worse = shown_rate(self.others * (self.calls - third), self.calls - third)
+        if self.first:
+            return (
+                f"{self.after!r} is to blame for where it ends: from the best third of its ends "
+                f"{self.skill!r} is done in {best}, from the others in {worse}{self._difference()}"
+            )
+        if self.alike:
+            ends = (
+                f"All ends of {self.after!r} are alike, so they do not say whether others would do"
+            )
+        else:
+            ends = f"From the best third of the ends of {self.after!r} it is done in {best}"
+        if self.works:
+            return ends
+        return f"{ends}. So {self.skill!r} itself has to work from there"
+
+    def _elsewhere(self) -> str:
+        """Return words on where the second skill works, and how these starts differ."""
+        where = ", ".join(
+            f"{'at the start of an episode' if name == START else f'after {name!r}'} "
+            f"({shown_rate(done, calls)})"
+            for name, done, calls in self.works[:SHOWN]
+        )
+        text = f"{self.skill!r} works {where}"
+        if self.differs is not None:
+            place, there, here = self.differs
+            text += (
+                f", where number {place} of the observation is {there:.2g} at the start of its "
+                f"calls, and {here:.2g} here"
+            )
+        if self.after == START:
+            return f"{text}; it has to learn to start here, too"
+        ends = "" if self.differs is None else f"{self.after!r} has to end as these do, "
+        return (
+            f"{text}. So {ends}another skill has to come in between, or {self.skill!r} has to "
+            f"learn to start where {self.after!r} ends"
+        )
 
     def _difference(self) -> str:
         if self.place is None:
@@ -465,7 +673,13 @@ def _predicted(at: Array, won: Array, known: Array, rows: Array) -> Array:
 def _largest_difference(
     vector: Array, best: Array, changes: Array
 ) -> tuple[int | None, tuple[float, float]]:
-    """Return the number that differs most between two groups of ends, of those that change."""
+    """Return the number that differs most between two groups of starts, of those that change.
+
+    Args:
+        vector: (n, F) of the starts.
+        best: (n,) bool, those of the first group.
+        changes: (F,) bool, the numbers that count.
+    """
     if not changes.any():
         return None, (float("nan"), float("nan"))
     one, other = vector[best].mean(0), vector[~best].mean(0)
@@ -515,7 +729,8 @@ class LinkedCalls(CallColumns):
             rows = self.began_late & (before == i) & (self.skill == j)
             ends = self.age[rows] + self.whole_steps[self.choice[rows]]
             needed[i, j] = np.quantile(ends, 0.5, method="higher")
-        return Handover(self.skills, calls, did, late, by_itself, self.time_limit, needed)
+        limit, steps = self.time_limit, self.steps
+        return Handover(self.skills, calls, did, late, by_itself, limit, needed, steps)
 
     def _too_late(self, calls: Array) -> str:
         """Return words on calls (k,) that began too late; empty: there are none."""
@@ -523,8 +738,10 @@ class LinkedCalls(CallColumns):
         if not len(late):
             return ""
         needed = self.age[late] + self.whole_steps[self.choice[late]]
-        return ": " + began_late_words(
-            len(late), self.time_limit, int(np.quantile(needed, 0.5, method="higher"))
+        return (
+            f": {len(late):,} began too late to run their whole length before the episode's time "
+            f"limit of {self.time_limit:,} steps; that takes episodes of about "
+            f"{int(np.median(needed)):,} steps, or shorter calls (call_steps, max_steps)"
         )
 
     @checked_names
@@ -562,31 +779,40 @@ class LinkedCalls(CallColumns):
                     + "; record more calls, chosen at random"
                 )
         maps = feature_maps(self, features, np.concatenate([self.start, self.end]))
-        # From the last skill back: the chance that the rest of the chain is done after each call.
-        chance = won[rows[-1]].astype(np.float64)
-        for i in reversed(range(len(skills) - 1)):
+        links = list[tuple[Array, Array]]()
+        for i, (some, following) in enumerate(pairwise(rows)):
             here = maps[numbers[i + 1]]
-            starts, ends = here(self.start[rows[i + 1]]), here(self.end[rows[i]])
-            near, distance = nearest(starts, ends, NEIGHBORS, rows[i + 1])
-            follows = (weights_of(distance) * chance[near]).sum(1)
-            may = self.may_follow[rows[i]].reshape(len(rows[i]), len(self.skills), -1)
-            goes_on = won[rows[i]] & ~self.terminated[rows[i]]
+            starts, ends = here(self.start[following]), here(self.end[some])
+            near, weights = _others(starts, ends, following, self.followed_by[some])
+            may = self.may_follow[some].reshape(len(some), len(self.skills), -1)
+            goes_on = won[some] & ~self.terminated[some]
             follows_on = goes_on & may[:, numbers[i + 1]].any(1)
             if goes_on.any() and not follows_on.any():
                 raise RunError(
                     f"{skills[i + 1]!r} may not start where any logged call of {skills[i]!r} was "
                     "done (its initiation() is False there), so this chain cannot be run"
                 )
-            chance = np.where(follows_on, follows, 0.0)
+            links.append((near, weights * follows_on[:, None]))
+        # Of each call the share of chains that come by it: at a start, then along the links.
+        shares = [np.full(len(rows[0]), 1 / len(rows[0]))]
+        for (near, weights), following in zip(links, rows[1:], strict=True):
+            passed = shares[-1][:, None] * weights
+            shares.append(np.bincount(near.ravel(), passed.ravel(), minlength=len(following)))
+        estimate = float(shares[-1] @ won[rows[-1]])
+        bounds = [
+            _bounds(estimate, share, self.episode[some])
+            for share, some in zip(shares, rows, strict=True)
+        ]
         matrix = self.handover(done)
         pairs = [matrix.of(b, a) for a, b in zip((START, *skills), skills, strict=False)]
         rates = tuple(rate for rate, _ in pairs)
         return Chain(
             tuple(skills),
-            float(chance.mean()),
+            estimate,
             float(np.prod(rates)),
             rates,
             tuple(count for _, count in pairs),
+            (min(low for low, _ in bounds), max(high for _, high in bounds)),
         )
 
     @checked_names
@@ -627,7 +853,7 @@ class LinkedCalls(CallColumns):
         Each call of the second skill after the first is predicted by the nearest other ones. If
         the third of the first skill's ends with the best predictions serve about as well as other
         starts do, and the other ends clearly worse, then the first skill is to blame for how it
-        ends; else the second has never learnt to start there.
+        ends. Else the second one has not learnt to start there; where it works is named.
 
         Args:
             skill: the second skill.
@@ -656,16 +882,22 @@ class LinkedCalls(CallColumns):
         nan, did = float("nan"), won[rows]
         elsewhere = float(won[others].mean()) if len(others) else nan
         reasons, rate = self.take(rows[~did]).reasons, float(did.mean())
+        starts = self.flat(self.start)
+        changes = np.ones(starts.shape[1], bool)
+        if after != START:
+            of_first = self.skill[self.owner] == self.number(after)
+            changes = (self.flat(self.before[of_first]) != self.flat(self.next_obs[of_first])).any(
+                0
+            )
+        works, differs = self._works(won, before, number, rows, starts, changes)
         unknown = Blame(
             skill, after, rate, elsewhere, len(rows), len(others), nan, nan, None, (nan, nan),
-            reasons, False,
+            reasons, False, works, differs,
         )  # fmt: skip
         if after == START or len(rows) < LEAST:
             return unknown
         maps = feature_maps(self, features, self.start)
         known = np.flatnonzero(counts & ~self.began_late)
-        starts, of_first = self.flat(self.start), self.skill[self.owner] == self.number(after)
-        changes = (self.flat(self.before[of_first]) != self.flat(self.next_obs[of_first])).any(0)
         # Where a number that the first skill does not change decides, none of its ends is better.
         score = _predicted(maps[number](self.start), won, known, rows)
         score = score - _predicted(
@@ -679,4 +911,52 @@ class LinkedCalls(CallColumns):
         _, high = wilson(did[~best].sum(), (~best).sum())
         first = good >= as_elsewhere - LIKE_ELSEWHERE and good - bad >= WORSE and low > high
         place, means = _largest_difference(starts[rows], best, changes)
-        return replace(unknown, best=good, others=bad, place=place, means=means, first=bool(first))
+        low, high = np.quantile(starts[:, changes], (0.05, 0.95), axis=0)
+        alike = starts[rows][:, changes].std(0) <= ALIKE * (high - low)
+        return replace(
+            unknown,
+            best=good,
+            others=bad,
+            place=place,
+            means=means,
+            first=bool(first),
+            alike=bool(changes.any() and alike.all()),
+        )
+
+    def _works(
+        self,
+        won: Array,
+        before: Array,
+        number: int,
+        rows: Array,
+        starts: Array,
+        changes: Array,
+    ) -> tuple[tuple[tuple[str, int, int], ...], tuple[int, float, float] | None]:
+        """Return ``works`` and ``differs`` of a ``Blame``.
+
+        Args:
+            won: (C,) bool, the calls that were done.
+            before: (C,) of ``before_each``.
+            number: of the skill.
+            rows: (n,) its calls that it is to explain.
+            starts: (C, F) flat observations at the starts of all calls.
+            changes: (F,) bool, the numbers that the first skill changes.
+        """
+        high = wilson(won[rows].sum(), len(rows))[1]
+        works, there = list[tuple[str, int, int]](), list[Array]()
+        for row in np.unique(before[(before >= 0) & (self.skill == number)]).tolist():
+            some = np.flatnonzero((before == row) & (self.skill == number))
+            done = won[some].sum()
+            if wilson(done, len(some))[0] > high:
+                works.append(((START, *self.skills)[row], int(done), len(some)))
+                there.append(some[won[some]])
+        works.sort(key=lambda entry: -entry[1] / entry[2])
+        if not works:
+            return (), None
+        both = np.concatenate([*there, rows])
+        place, (one, other) = _largest_difference(
+            starts[both], np.arange(len(both)) < len(both) - len(rows), changes
+        )
+        if place is None or np.isclose(one, other):
+            return tuple(works), None
+        return tuple(works), (place, one, other)

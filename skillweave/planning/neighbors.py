@@ -28,8 +28,8 @@ Features = Callable[[Array], Any] | Sequence[int]
 """Features of observations: a function (n, *obs_shape) to (n, F), or places in the flat vector."""
 
 FEATURES = (
-    "declare Hierarchy(features=...), or give features= to plan(): a function from observations "
-    "(n, …) to numbers (n, F)"
+    "declare Hierarchy(features=...), or give features= to plan(), chain() or blame(): a function "
+    "from observations (n, …) to numbers (n, F)"
 )
 """Advice where images cannot be compared."""
 

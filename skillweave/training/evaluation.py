@@ -152,6 +152,12 @@ class Evaluation:
         missing = "no skill that defines success acted alone"
         return _known(self.details.reached, f"{missing}: {SCORE_ALONE}")
 
+    def comparing(self, features: Any) -> Evaluation:
+        """Return the same, with logs whose calls are compared by a hierarchy's ``features``."""
+        logs = dict(self.details.logs or {})
+        logs[""] = replaced(logs[""], features=features)
+        return replaced(self, details=replaced(self.details, logs=logs))
+
     @property
     def mean(self) -> float:
         """Mean return."""
@@ -260,7 +266,8 @@ class Evaluation:
             most = f"{max(self.lengths):,} steps (max_steps)"
             line += f"; {self.cut} never ended and were cut after {most}"
         if self.alone is not None:
-            line += f"; {call_line(self.alone, self.skills[self.alone])}"
+            report = self.skills[self.alone]
+            line += f"; {call_line(self.alone, report, len(self.lengths))}"
         elif self.skills:
             shares = ", ".join(f"{k} {v:.0%}" for k, v in j["skill_usage"].items())
             line += f"; skills: {shares}"

@@ -17,7 +17,7 @@ from skillweave.planning.columns import (
     time_limit_of,
     whole_steps,
 )
-from skillweave.planning.handover import Handover, pair_counts
+from skillweave.planning.handover import FEW, LEAST, Handover, pair_counts
 from skillweave.planning.recorder import Recorder
 from skillweave.policies.core import CallEnd
 from skillweave.schema import Check, Count
@@ -66,6 +66,8 @@ class SkillReport:
     unknown."""
     idle: Count = field(default=0, compare=False)
     """Calls that ended by themselves after one step, right after a call of it with such an end."""
+    at_once: Count = field(default=0, compare=False)
+    """Calls that ended by themselves after one step."""
     late: Count = field(default=0, compare=False)
     """Calls that went on to their limit after they had succeeded, of a skill with neither
     an end nor a length of its own."""
@@ -83,6 +85,16 @@ class SkillReport:
     not count in ``success_rate``."""
     began_late_succeeded: Count = field(default=0, compare=False)
     """Those of them that succeeded."""
+
+    @property
+    def cannot_last(self) -> bool:
+        """True if each call ended by itself after one step, and that did not do its work.
+
+        A move of one step that succeeds, or that was given and has no ``success``, is right.
+        """
+        works = self.succeeded or (self.succeeded is None and not self.learns)
+        every = self.at_once == self.calls >= FEW and self.own_with_episode < self.calls
+        return every and not works
 
     @property
     def counted(self) -> int:
@@ -152,6 +164,7 @@ def _level_reports(
         "calls": np.ones(len(rows), bool),
         "first": before == 0,
         "idle": own & again & (rows["steps"] == 1),
+        "at_once": own & (rows["steps"] == 1),
         "late": rows["late"],
         "hasty": hasty & (not alone),
         "own_with_episode": own & over,
@@ -197,7 +210,7 @@ def weak_handovers(calls: PlayedCalls) -> list[str]:
         late = _began_late(recorder, rows, limit)
         pairs = pair_counts(before, skill, won, len(names), follows & ~late)
         none = np.zeros_like(pairs[0])
-        sentences += Handover(names, *pairs, none, (), limit, none).weakest()
+        sentences += Handover(names, *pairs, none, time_limit=limit).weak_sentences(LEAST)
     return sentences
 
 
@@ -308,8 +321,12 @@ def skill_table(skills: Mapping[str, SkillReport]) -> str:
     return aligned([TITLES, *map(cells_of, skill_rows(skills))], left=1)
 
 
-def call_line(name: str, report: SkillReport) -> str:
-    """Return a part of a sentence on the calls of a skill that acts alone."""
+def call_line(name: str, report: SkillReport, episodes: int) -> str:
+    """Return a part of a sentence on the calls of a skill that acts alone.
+
+    Args:
+        episodes: that were played; the skill begins once in each, if it may.
+    """
     if not report.calls:
         return f"{name} could start nowhere by its initiation()"
     results = []
@@ -318,12 +335,26 @@ def call_line(name: str, report: SkillReport) -> str:
     if report.success_rate is not None:
         results.append(f"{report.success_rate:.0%} succeed")
     called = f"{name} alone: {report.calls:,} calls of {report.length_mean:,.0f} steps"
+    if never := episodes - report.calls:
+        results.append(
+            f"in {never:,} of {episodes:,} episodes it never began, as its initiation() was False"
+        )
     return ", ".join([called, *results])
 
 
 def hints(skills: Mapping[str, SkillReport]) -> list[str]:
     """Return a sentence on each probable mistake."""
-    return [*idle_calls(skills), *late_calls(skills), *hasty_calls(skills)]
+    others = {name: report for name, report in skills.items() if not report.cannot_last}
+    instant = [instant_calls(name, skills[name]) for name in skills if name not in others]
+    return [*instant, *idle_calls(skills), *late_calls(others), *hasty_calls(others)]
+
+
+def instant_calls(name: str, report: SkillReport) -> str:
+    """Return a sentence on a skill that ``cannot_last``."""
+    return (
+        f"Every call of {name!r} ({report.calls:,}) ended after one step: its termination() is "
+        "true there. If that is so everywhere, its condition is wrong, and no call can do more."
+    )
 
 
 def reflex_lines(reflexes: Mapping[str, int], total: int) -> list[str]:
@@ -344,7 +375,8 @@ def idle_calls(skills: Mapping[str, SkillReport]) -> list[str]:
     levels = [level_of(name) for name in skills]
     for name, report in skills.items():
         others = report.calls - report.idle
-        if report.has_goals or levels.count(level_of(name)) == 1:
+        only = levels.count(level_of(name)) == 1
+        if report.has_goals or only or report.cannot_last:
             continue
         if report.idle > others and report.steps - report.idle > 2 * others:
             sentences.append(
@@ -417,6 +449,8 @@ def useless_skills(
                 f"see that its initiation() is True where the other skills end{further}; else "
                 "leave it out."
             )
+        elif report.cannot_last:
+            sentences.append(instant_calls(name, report))
         elif report.succeeded == 0:
             advice = (
                 "Give it more steps or longer calls (call_steps), or a reward that leads there"

@@ -247,10 +247,18 @@ class StageLog:
         entry.succeeded = self._succeeded()
         self.run.save()
         if entry.succeeded is False:
+            advice = (
+                "It may need more steps, a reward that leads there step by step, or states nearer "
+                "to it: start_calls, episode_calls, initiation()"
+            )
+            if at.metrics.get("length") == 1.0:
+                advice = (
+                    "Every call ended after one step: perhaps its termination() is always true (or "
+                    "its max_steps or call_steps is 1)"
+                )
             self.message(
                 "no call ended with success() true, so stages after this one build on a skill that "
-                "does not work. It may need more steps, a reward that leads there "
-                "step by step, or states nearer to it: start_calls, episode_calls, initiation()"
+                f"does not work. {advice}"
             )
         self.run.drop_checkpoints()
         self.run.drop_used(entry)
