@@ -133,13 +133,14 @@ ALGORITHM = settings(sw.PPO(), sw.DQN())
 INFO_KEYS = Kind((5, "x", None, {"x": 1}, [5], [""], [None]), (["x"], ("x", "y"), []))
 ENV = Kind((5, True, None, [], {}, gym.Env()), ("CartPole-v1", sw.EnvSpec("CartPole-v1")))
 
+MILLION, THREADS = whole(1, 1_000_000), whole(1, 1024)
 ON_POLICY = {
-    "num_envs": AT_LEAST_ONE, "n_steps": AT_LEAST_ONE, "learning_rate": RATE, "gamma": FRACTION,
-    "normalize_obs": FLAG, "network": NETWORK, "overlap": FLAG, "threads": AT_LEAST_ONE,
+    "num_envs": MILLION, "n_steps": MILLION, "learning_rate": RATE, "gamma": FRACTION,
+    "normalize_obs": FLAG, "network": NETWORK, "overlap": FLAG, "threads": THREADS,
     "device": DEVICE,
 }  # fmt: skip
 PPO = ON_POLICY | {
-    "batch_size": AT_LEAST_ONE, "update_epochs": AT_LEAST_ONE,
+    "batch_size": AT_LEAST_ONE, "update_epochs": MILLION,
     "learning_rate_schedule": word("constant", "linear"), "adam_eps": POSITIVE,
     "gae_lambda": FRACTION, "clip_coef": POSITIVE, "clip_value": or_none(POSITIVE),
     "ent_coef": NON_NEGATIVE, "ent_coef_final": or_none(NON_NEGATIVE), "epsilon": FRACTION,
@@ -150,14 +151,14 @@ PPO = ON_POLICY | {
     "compile": COMPILE,
 }  # fmt: skip
 OFF_POLICY = {
-    "num_envs": AT_LEAST_ONE, "train_freq": AT_LEAST_ONE, "update_ratio": POSITIVE,
-    "buffer_size": Kind(AT_LEAST_ONE.refused, (1000, np.int64(1000))), "learning_starts": COUNT,
-    "batch_size": whole(1, 1_000_000), "n_step": AT_LEAST_ONE, "prioritized": FLAG,
+    "num_envs": Kind(MILLION.refused, (8, np.int64(8))), "train_freq": AT_LEAST_ONE, "update_ratio": POSITIVE,
+    "buffer_size": Kind(whole(1, 10**9).refused, (1000, np.int64(1000))), "learning_starts": COUNT,
+    "batch_size": whole(1, 1_000_000), "n_step": MILLION, "prioritized": FLAG,
     "priority_alpha": FRACTION, "priority_beta": FRACTION, "learning_rate": RATE,
     "learning_rate_schedule": word("constant", "linear"), "adam_eps": POSITIVE, "gamma": FRACTION,
     "tau": FRACTION, "max_grad_norm": or_none(POSITIVE), "normalize_obs": FLAG,
     "normalize_rewards": FLAG, "network": NETWORK, "save_buffer": FLAG, "overlap": FLAG,
-    "action_repeat": FRACTION, "action_repeat_steps": AT_LEAST_ONE, "threads": AT_LEAST_ONE,
+    "action_repeat": FRACTION, "action_repeat_steps": MILLION, "threads": THREADS,
     "compile": COMPILE, "device": DEVICE,
 }  # fmt: skip
 ACTOR_CRITIC = OFF_POLICY | {"critic": or_none(NETWORK)}
@@ -165,11 +166,11 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
     OnPolicy: ON_POLICY,
     sw.PPO: PPO,
     sw.SelfImitationPPO: PPO | {
-        "imitation_rows": AT_LEAST_ONE, "imitation_steps": AT_LEAST_ONE,
+        "imitation_rows": whole(1, 10**9), "imitation_steps": MILLION,
         "imitation_coef": NON_NEGATIVE, "imitation_vf_coef": NON_NEGATIVE,
     },
     SkillCritic: ON_POLICY | {
-        "batch_size": AT_LEAST_ONE, "update_epochs": AT_LEAST_ONE, "gae_lambda": FRACTION,
+        "batch_size": AT_LEAST_ONE, "update_epochs": MILLION, "gae_lambda": FRACTION,
         "adam_eps": POSITIVE, "max_grad_norm": POSITIVE, "deciding": FLAG, "sees_goals": FLAG,
         "min_advantage_std": NON_NEGATIVE, "epsilon": FRACTION, "epsilon_final": or_none(FRACTION),
         "epsilon_fraction": FRACTION,
@@ -178,7 +179,7 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
     ActorCritic: ACTOR_CRITIC,
     sw.DQN: OFF_POLICY | {
         "double": FLAG, "dueling": FLAG, "noisy": FLAG, "distributional": FLAG,
-        "n_atoms": whole(2), "v_min": or_none(ANY), "v_max": or_none(ANY),
+        "n_atoms": whole(2, 100_000), "v_min": or_none(ANY), "v_max": or_none(ANY),
         "exploration_fraction": FRACTION, "exploration_initial_eps": FRACTION,
         "exploration_final_eps": FRACTION, "target_update_interval": AT_LEAST_ONE,
         "loss": word("huber", "mse"),

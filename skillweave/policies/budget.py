@@ -11,11 +11,11 @@ import numpy as np
 from .actor import Deployed
 from .hierarchy import Hierarchy
 from .leaves import Network
-from .mapped import Mapped, OnnxFile, Take
+from .mapped import LONGEST, Mapped, OnnxFile, Take
 from .plan import Options
 from .planned import LATEST, Planned
 from .selectors import Automaton
-from .spaces import Space
+from .spaces import MOST, Space
 
 BUDGET = 2**31
 """The most bytes that acting in one environment may take, those of arrays in files not counted."""
@@ -39,6 +39,8 @@ def _space(values: Values) -> int:
     if values.get("parts") is not None:
         return 0
     size = prod(values.get("shape", ()))
+    if size > MOST:  # it is refused
+        return 0
     # Choices are lists of Python's numbers.
     return size * (16 if values["kind"] == "Box" else 128)
 
@@ -63,7 +65,7 @@ def _session(file: bytes) -> int:
 
 def _mapped(values: Values) -> int:
     states = sum(prod(shape) for shape, _ in values["model"].states)
-    actions = values.get("chunk") or 1
+    actions = min(values.get("chunk") or 1, LONGEST)
     return 32 * states + 4 * actions * _bytes(values["outputs"].space)
 
 

@@ -45,6 +45,8 @@ LONGEST_NAME = 200
 """The most characters of a file's name."""
 LONGEST_ERROR = 1_000
 """The most characters of a message about a field: names and spaces in it are from the file."""
+LONGEST_TEXT = 4096
+"""The most characters of a name."""
 MOST_SHOWN = 20
 """The most functions of the field ``code`` that a message lists."""
 ROOMS = (actor, hierarchy, leaves, mapped, parts, plan, planned, selectors, spaces)
@@ -208,6 +210,10 @@ class Reader:
         kind, origin, inner = fitting[0]
         if kind is float:
             return float(entry["float"]) if isinstance(entry, dict) else float(entry)
+        if kind is str or origin is dict:
+            for text in (entry,) if kind is str else entry:
+                if len(text) > LONGEST_TEXT:
+                    raise _unfit(where, text, f"a text of at most {LONGEST_TEXT:,} characters")
         if kind is int or kind in PLAIN or origin is Literal:
             return entry
         if kind is bytes:

@@ -40,6 +40,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 FREE = {"file": "free.onnx"}
 STATE = {"type": "Automaton", "who": "it", "skills": ["free", "remembers"], "goals": {}}
+REVERSED = ["remembers", "free"]
+ONE = {"states": {"a": ["free"]}, "transitions": [], "first": "a"}
 WRONG: list[tuple[str, Any]] = [
     ("policy.type", "PartOf"),
     ("policy.skills[0].policy.choices", 9),
@@ -55,6 +57,22 @@ WRONG: list[tuple[str, Any]] = [
     ("policy.selector.file.file", "free.onnx"),
     ("policy.selector", STATE | {"states": {"a": ["fre"]}, "transitions": [], "first": "a"}),
     ("policy.selector", STATE | {"states": {"a": ["free"]}, "transitions": [], "first": "b"}),
+    ("policy.selector", STATE | ONE),  # it chooses no lengths
+    ("policy.selector", STATE | ONE | {"skills": ["free", "other"]}),
+    ("policy.guide", {"type": "ActiveGuide", "selector": STATE | ONE | {"skills": ["free"]}}),
+    ("policy.guide", {"type": "ActiveGuide", "selector": STATE | ONE | {"skills": REVERSED}}),
+    ("policy.skills[0].limit", 0),
+    ("policy.skills[0].max_steps", -1),
+    ("policy.fresh_calls", True),
+    ("policy.interruption.margin", -0.5),
+    ("policy.skills[1].policy.memory", 10**12),
+    ("policy.skills[0].policy.noise", [["gumbel", 10**12]]),
+    ("policy.skills[0].policy.sees.shape", [10**8]),
+    ("policy.skills[0].policy.sees.dtype", "V1000000000000"),
+    ("policy.skills[0].policy.acts.high", {"array": 1, "dtype": "V1000000000000"}),
+    ("policy.skills[0].policy.acts.high", {"array": 1, "dtype": {"names": [], "itemsize": 9}}),
+    ("policy.skills[0].policy.sees.kind", "Discrete"),
+    ("policy.skills[0].name", "x" * 5_000_000),
     ("policy.lengths", [3, 1]),
     ("policy.lengths", list(range(1, 200_000))),
     ("policy.lengths", [0]),
@@ -77,8 +95,18 @@ def test_a_manifest_that_contradicts_its_files_is_refused(
         part = part[key]
     part[last] = value
     file.write_text(json.dumps(manifest))
-    with pytest.raises(RunError, match=r"policy\.json: policy\."):
+    with pytest.raises(RunError, match=r"policy\.json: policy\.") as caught:
         sw.load_policy(file)
+    assert len(str(caught.value)) < 1500
+
+
+def test_a_guide_leaves_the_lengths_to_the_selector(exported: Path, tmp_path: Path) -> None:
+    shutil.copytree(exported, tmp_path / "copy")
+    file = tmp_path / "copy/policy.json"
+    manifest = json.loads(file.read_text())
+    manifest["policy"]["policy"]["guide"] = {"type": "ActiveGuide", "selector": STATE | ONE}
+    file.write_text(json.dumps(manifest))
+    assert sw.Player(sw.load_policy(file)).act(np.zeros(4, np.float32)) is not None
 
 
 def test_a_critic_without_the_value_of_a_new_decision_is_refused(tmp_path: Path) -> None:

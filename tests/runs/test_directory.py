@@ -362,6 +362,14 @@ def test_a_damaged_line_in_the_middle_is_an_error_that_names_the_file(
         list(run.metrics())
 
 
+def test_a_line_without_end_is_not_read(run: RunDirectory) -> None:
+    with (run.path / "metrics.jsonl").open("w") as file:
+        file.write('{"update": 1}\n')
+        file.truncate(2**40)  # it has no bytes on the disk
+    with pytest.raises(RunError, match=r"metrics\.jsonl is damaged in line 2: it has more than"):
+        list(run.metrics())
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
 def test_metrics_on_a_full_disk_say_so_and_the_run_can_still_be_closed(tmp_path: Path) -> None:
     run = RunDirectory.create(tmp_path / "run", manifest())
@@ -405,6 +413,24 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
             lambda m: m["hierarchy"].update(call_steps=0),
             "hierarchy.call_steps is 0; it must be at least 1, or None",
         ),
+        (
+            lambda m: m["stages"][0]["algorithm"].pop("num_envs"),
+            "the settings of an algorithm, among them",
+        ),
+        (
+            lambda m: m["stages"][0].update(algorithms={"a b": {}}),
+            "stages[0].algorithms: a name is 'a b'; it must be names of letters",
+        ),
+        (
+            lambda m: m["stages"][0].update(algorithms={"landing": {"algorithm": "SAC", "tau": 2}}),
+            "stages[0].algorithms['landing'].tau is 2; it must be between 0 and 1",
+        ),
+        (
+            lambda m: m["stages"][0].update(evolution={}),
+            "stages[0].evolution is {}; it must be the settings of a population",
+        ),
+        (lambda m: m["stages"][0].update(workers=10**9), "at least 1 and at most 1,024"),
+        (lambda m: m.update(skills=[]), "skills has no skill at all"),
         (lambda m: m.update(call_steps=10), "has no field call_steps: made by a newer version?"),
         (
             lambda m: m["stages"][0]["algorithm"].update(gamma="a"),
