@@ -23,7 +23,7 @@ def shown(value: object, most: int = _SHOWN) -> str:
         text = repr(value)
     except Exception:  # a number of too many digits, or nested too deep
         text = f"a {type(value).__name__}"
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 # Files

@@ -232,7 +232,8 @@ class Evaluation:
             f"{value:.{digits}f}" for value in (self.mean, j["std"], *j["ci95"], j["iqm"])
         )
         line = (
-            f"{mean} ± {std} over {len(self.returns)} episodes (95 % CI {low} to {high}, IQM {iqm})"
+            f"{mean} +/- {std} over {len(self.returns)} episodes "
+            f"(95 % CI {low} to {high}, IQM {iqm})"
         )
         if self.solved_fraction is not None:
             line += f", {self.solved_fraction:.0%} at {self.threshold:g} or more"
