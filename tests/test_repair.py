@@ -402,7 +402,7 @@ def test_events_of_the_caller_judge_and_are_needed_again(run, tmp_path):
     with pytest.raises(DeclarationError, match="nothing to repair"):
         repaired(run, tmp_path / "a", done=done)
     done = {"press": at_goal}
-    with pytest.raises(Interrupted, match="done=…"):
+    with pytest.raises(Interrupted, match=r"done=\.\.\."):
         repaired(run, tmp_path / "b", done=done, callback=stop, **SHORT)
     with pytest.raises(RunError, match=r"is judged by done= of press, which is code: continue"):
         declare().resume(tmp_path / "b", quiet=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import io
 import json
 import os
@@ -15,6 +16,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 
+import skillweave
 from skillweave import Agent, EnvSpec, Hierarchy, SkillweaveError
 from skillweave._internal.terminal import one_line, printable
 from skillweave.cli import main
@@ -311,3 +313,41 @@ def test_a_run_in_a_locale_of_ascii(tmp_path):
         )
         assert done.returncode == 0, done.stderr.decode(errors="replace")
         assert b"Traceback" not in done.stderr
+
+
+PICTURES = ("reporting/report/", "reporting/lineage.py", "reporting/curves_figure.py")
+PICTURES += ("reporting/displays.py",)
+"""Modules whose texts are drawn, or written to pages and terminals that know all letters."""
+
+
+def test_texts_that_users_may_print_are_ascii():
+    root = Path(skillweave.__file__).parent
+    wrong = []
+    for path in sorted(root.rglob("*.py")):
+        name = path.relative_to(root).as_posix()
+        if name.startswith(PICTURES) or name == "policies/errors.py":  # it escapes such letters
+            continue
+        nodes = list(ast.walk(ast.parse(path.read_text("utf-8"))))
+        comments = [x.value for x in nodes if isinstance(x, ast.Expr)]  # docstrings
+        wrong += [
+            f"{name}:{x.lineno}: {x.value!r}"
+            for x in nodes
+            if isinstance(x, ast.Constant) and isinstance(x.value, str)
+            if not x.value.isascii() and x not in comments
+        ]
+    assert wrong == []
+
+
+def test_results_and_errors_can_be_printed_where_the_encoding_knows_ascii_alone(tmp_path):
+    trained = Hierarchy(WARM, [Left()], algorithm=ON, selector=ON, steps=STEPS).train(
+        tmp_path / "run", quiet=True
+    )
+    score = trained.evaluate(2, quiet=True)
+    trained.log_calls(60)
+    with pytest.raises(SkillweaveError) as caught:
+        trained.evaluate("x" * 1000)
+    with open(tmp_path / "out.txt", "w", encoding="ascii") as out:
+        for made in (score, score.for_people(), trained, trained.calls, trained.calls.handover()):
+            print(made, repr(made), file=out)
+        for made in (trained.calls.chain("left", "left"), trained.info(), caught.value):
+            print(made, file=out)

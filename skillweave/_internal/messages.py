@@ -57,7 +57,7 @@ def short(value: object, longest: int = 100) -> str:
 def shortened(text: str, longest: int = 500) -> str:
     """Return text for a message, its middle left out where it is long."""
     half = longest // 2
-    return text if len(text) <= longest else f"{text[:half]} … {text[-half:]}"
+    return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int = 0) -> str:

@@ -143,7 +143,7 @@ class PPO(OnPolicy):
             check(self, "compile", self.compile is not True, "False where network.rnn is set")
         rollout = self.num_envs * self.n_steps
         most = max(rollout, PPO.batch_size)  # a small rollout alone is no mistake
-        rule = f"at most {most}; a rollout has num_envs·n_steps ({rollout}) samples"
+        rule = f"at most {most}; a rollout has num_envs * n_steps ({rollout}) samples"
         check(self, "batch_size", self.batch_size <= most, rule)
 
 
@@ -291,7 +291,7 @@ class OffPolicy:
             self,
             "buffer_size",
             self.buffer_size >= least,
-            f"at least {least} (num_envs·(n_step+1))",
+            f"at least {least} (num_envs * (n_step + 1))",
         )
 
 

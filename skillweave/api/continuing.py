@@ -143,7 +143,7 @@ def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
         elif wanted > budget and entry.done and not finished:
             sentences.append(f"{name} can be given more steps once the run is finished")
         elif wanted > budget:
-            sentences.append(f"{name} continues: {budget:,} → {wanted:,} steps")
+            sentences.append(f"{name} continues: {budget:,} -> {wanted:,} steps")
             grown.append(entry)
     for entry in grown:
         _check_grows(run, entry, more[entry.name])

@@ -70,7 +70,7 @@ def _no_recipe(name: str) -> str:
             f"sw.train_agent({python_string(name)}, sw.PPO(), 100_000)"
         )
     if name.endswith(".py"):
-        return f"the file {name!r} does not exist"
+        return f"no file {name!r}, and no recipe of this name{suggest(name, names())}"
     if name.endswith((".yaml", ".yml", ".json", ".toml", ".ini")):
         return (
             f"{name!r} is no recipe: a Python file declares the hierarchy, and --set NAME=VALUE "

@@ -122,8 +122,8 @@ class ImageEncoder:
                     raise DeclarationError(
                         f"Network.cnn does not fit images of {obs.images[index]} (channels, "
                         f"height, width): layer {i} has a kernel of {kernel} pixels, but only "
-                        f"{height}×{width} are left; omit cnn, then CNN.small() or CNN() is chosen "
-                        "by size, or use smaller kernels or fewer layers"
+                        f"{height} x {width} are left; omit cnn, then CNN.small() or CNN() is "
+                        "chosen by size, or use smaller kernels or fewer layers"
                     )
                 self._layer(str(i), channels, out, kernel)
                 height, width = ((x - kernel) // stride + 1 for x in (height, width))

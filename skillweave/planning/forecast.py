@@ -59,7 +59,7 @@ class Forecast:
     def __str__(self) -> str:
         """Return all of it as a line."""
         names = [f"{name} ({steps:.0f} steps)" for name, steps in self.calls[:SHOWN]]
-        text = " → ".join([*names, "…"] if len(self.calls) > SHOWN else names)
+        text = " -> ".join([*names, "..."] if len(self.calls) > SHOWN else names)
         if self.chance is not None:
             low, high = self.interval
             text += f": a chance of {self.chance:.0%} ({low:.0%} to {high:.0%})"

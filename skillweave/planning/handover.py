@@ -293,7 +293,7 @@ class Handover:
             [
                 name,
                 *(
-                    shown_rate(done, calls, "") if calls else "–"
+                    shown_rate(done, calls, "") if calls else "-"
                     for done, calls in zip(self.done[i], self.calls[i], strict=True)
                 ),
             ]
@@ -336,7 +336,7 @@ class Chain:
         if 0 in self.calls:
             name = self.skills[self.calls.index(0)]
             return f"{text}no product, as no logged call of {name!r} came right after and counts"
-        factors = " × ".join(
+        factors = " x ".join(
             f"{rate:.0%} of {calls:,}" for rate, calls in zip(self.rates, self.calls, strict=True)
         )
         return f"{text}{self.product:.0%} as the product {factors}"

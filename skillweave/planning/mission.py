@@ -555,7 +555,9 @@ class _Parser:
         if token.text not in self.predicates:
             if not self.predicates:
                 name = token.text
-                self.fail(f"{name!r} is no known predicate: give predicates={{{name!r}: …}}", token)
+                self.fail(
+                    f"{name!r} is no known predicate: give predicates={{{name!r}: ...}}", token
+                )
             end = suggest(token.text, self.predicates)
             self.fail(f"{token.text!r} is no known predicate{end}", token)
         event = self.predicates[token.text]

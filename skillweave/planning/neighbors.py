@@ -29,7 +29,7 @@ Features = Callable[[Array], Any] | Sequence[int]
 
 FEATURES = (
     "declare Hierarchy(features=...), or give features= to plan(), chain() or blame(): a function "
-    "from observations (n, …) to numbers (n, F)"
+    "from observations (n, ...) to numbers (n, F)"
 )
 """Advice where images cannot be compared."""
 
@@ -42,7 +42,7 @@ def check_features(features: Any, who: str) -> None:
         if isinstance(one, type) or not (one is None or callable(one) or places):
             raise DeclarationError(
                 f"{who}: features is {short(one)}; give places in the observation, features=[0, 1],"
-                " or a function of observations (n, …) to (n, F), or a dict of these by skill"
+                " or a function of observations (n, ...) to (n, F), or a dict of these by skill"
             )
 
 
@@ -153,7 +153,7 @@ class FeatureMap:
             )
 
     def raw(self, obs: Array) -> Array:
-        """Return the features of observations (n, …) as they are, (n, F) float64."""
+        """Return the features of observations (n, ...) as they are, (n, F) float64."""
         if self._codec is not None:
             vector = self._codec.split(to_tensor(obs))[0].numpy().reshape(len(obs), -1)
             features: Array = vector[:, self.places].astype(np.float64)
@@ -163,7 +163,7 @@ class FeatureMap:
         except (Exception, SystemExit) as error:
             raise DeclarationError(
                 f"features() of {self._who} raised {error_text(error)}; it must be a function of "
-                "observations (n, …)"
+                "observations (n, ...)"
             ) from error
         if value.ndim == 1 and len(value) == len(obs):
             value = value[:, None]

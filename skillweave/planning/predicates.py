@@ -70,7 +70,7 @@ class Predicate:
         return _of(np.logical_not, f"not {self.name}", self)
 
     def _joined(self, other: Any, word: str, join: Callable[..., Array]) -> Predicate:
-        second = as_predicate(other, f"{self.name} {word} …")
+        second = as_predicate(other, f"{self.name} {word} ...")
         return _of(join, f"({self.name} {word} {second.name})", self, second)
 
     def holds(self, step: Step) -> Array:
@@ -227,7 +227,7 @@ def _hint(error: SkillError) -> str | None:
     fields = {field.name for field in dataclasses.fields(Step)}
     if isinstance(cause, AttributeError) and cause.name in fields:
         return (
-            "it was given observations, (n, …), as its argument is not named 'step': write "
+            "it was given observations, (n, ...), as its argument is not named 'step': write "
             "lambda step: ..., annotate it with Step, or write Predicate(function, reads='step')"
         )
     return None

@@ -364,7 +364,7 @@ def asked(function: Callable[..., Any], about: Any, rows: Array, path: str, name
 def observed(obs: Array) -> str:
     """Return an observation for a message, in one line, its middle left out where it is long."""
     text = " ".join(np.array2string(obs, precision=3, threshold=20).split())
-    return text if len(text) <= 200 else f"{text[:100]} … {text[-100:]}"
+    return text if len(text) <= 200 else f"{text[:100]} ... {text[-100:]}"
 
 
 # Memories ---------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ def shown(value: object, most: int = _SHOWN) -> str:
 
 def shown_text(text: str, most: int = _SHOWN) -> str:
     """Return a text for a message, shortened."""
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 # Files

@@ -74,7 +74,7 @@ def repair_words(repair: RepairEntry, run: RunLike) -> str:
     """Return the line of Python that continues a repair."""
     given = [python_string(repair.skill), f"after={python_string(repair.after)}"]
     given.append(f"run_dir={python_string(shown_path(run.path))}")
-    given += ["done=…"] if repair.done else []
+    given += ["done=..."] if repair.done else []
     return f"run.repair({', '.join(given)}, resume=True)"
 
 

@@ -339,6 +339,8 @@ ABOVE = 2
 """Folders above a file that may be its run: ``<run>/policies/<file>``."""
 TRACKERS = ("wandb",)
 """Folders of trackers that make links to other files of the same folder."""
+OF_TRACKERS = "wandb/*/logs/debug-core.log"
+"""A link that W&B makes to its own log outside, and through which nothing is written later."""
 
 
 def check_no_links(run: Path) -> None:
@@ -392,8 +394,10 @@ def _entries(folder: Path) -> Iterator[Path]:
 
 
 def _stays_in_tracker(run: Path, link: Path) -> bool:
-    """Return whether a link is in a tracker's folder, and leads to something there."""
+    """Return whether a link in a tracker's folder leads to something there, or is its log's."""
     folder = run / link.relative_to(run).parts[0]
     if folder.name not in TRACKERS or folder == link:
         return False
+    if link.relative_to(run).match(OF_TRACKERS):
+        return True
     return link.resolve().is_relative_to(folder.resolve())

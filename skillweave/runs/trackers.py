@@ -6,20 +6,27 @@ import hashlib
 import importlib
 import importlib.util
 import os
+import re
 import struct
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from skillweave._internal.messages import error_text, suggest
-from skillweave._internal.terminal import say
+from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.policies.core import flat
 from skillweave.runs.directory import RunDirectory
 from skillweave.schema import as_json
 
+WANDB_PROJECT = "skillweave"
+"""The project of all runs, in W&B."""
+WANDB_LONGEST_NAME = 128
+"""The most characters of a run's name in W&B."""
+WANDB_SEVERAL = (0, 19, 10)
+"""The first version of wandb in which a program can have several runs open."""
 MLFLOW_EXPERIMENT = "skillweave"
 """The experiment of all runs, in MLflow."""
 MLFLOW_TAG = "skillweave.run"
@@ -32,6 +39,12 @@ MLFLOW_MOST_SETTINGS = 100
 """The most settings that are sent at once."""
 MLFLOW_LONGEST_SETTING = 500
 """The most characters of a setting's value in MLflow."""
+MLFLOW_LONGEST_NAME = 250
+"""The most characters of the name of a metric or a setting in MLflow."""
+MLFLOW_LONGEST_KEY = 100
+"""The most characters of a key of ``info`` in such a name."""
+MLFLOW_REFUSED = re.compile(r"[^\w.\- /]" if os.name == "nt" else r"[^\w.\- /:]")
+"""A character that MLflow refuses in names."""
 
 
 class Listener:
@@ -110,22 +123,43 @@ class TensorBoard(Tracker):
 class WandB(Tracker):
     """A tracker of one Weights & Biases run; offline without a login, for which it never asks.
 
-    A resumed run continues it: its id follows from the run's path and time of creation.
+    A resumed run continues it: its id follows from the run's path and time of creation. A run that
+    the program has open stays open and as it is. Only if it is one of a sweep, whose agent reads
+    its metrics, this tracker logs into it.
+
+    Raises:
+        RunError: W&B does not answer.
     """
 
     def __init__(self, run: RunDirectory) -> None:
         import wandb
 
-        self._run: Any = wandb.init(
-            project="skillweave",
-            name=run.path.name,
-            id=identifier(run),
-            resume="allow",
-            dir=str(run.path),
-            config=as_json(run.manifest),
-            mode=wandb_mode(),
-            settings=wandb.Settings(silent=True),
-        )
+        outer: Any = wandb.run
+        several = _numbers(wandb.__version__) >= WANDB_SEVERAL
+        self._is_outer = outer is not None and (bool(outer.sweep_id) or not several)
+        if outer is not None and not run.finished:
+            notice(_about_outer(outer, self._is_outer))
+        if self._is_outer:
+            self._run: Any = outer
+            return
+        beside = {} if outer is None else {"reinit": "create_new"}
+        try:
+            self._run = wandb.init(
+                project=WANDB_PROJECT,
+                name=run.path.name[:WANDB_LONGEST_NAME],
+                id=identifier(run),
+                resume="allow",
+                dir=str(run.path),
+                config=as_json(run.manifest),
+                mode=wandb_mode(),
+                settings=wandb.Settings(silent=True),
+                **beside,
+            )
+        except Exception as error:  # of any server
+            raise RunError(
+                f"W&B does not answer: {error_text(error)}. Set WANDB_MODE=offline, or train "
+                "without this tracker"
+            ) from error
 
     def stage(self, name: str, budget: int) -> None:
         """Plot metrics of this stage over its own steps."""
@@ -142,8 +176,28 @@ class WandB(Tracker):
         self._run.log({f"film/{path.stem}": wandb.Video(str(path)), "film/steps": steps})
 
     def close(self) -> None:
-        """Finish the run."""
-        self._run.finish()
+        """Finish the run, unless it is the program's."""
+        if not self._is_outer:
+            self._run.finish()
+
+
+def _about_outer(outer: Any, is_used: bool) -> str:
+    """Return a sentence on a run of W&B that the program has open."""
+    name = f"the W&B run {outer.name or outer.id!r}"
+    if not is_used:
+        return (
+            f"{name} is open and stays as it is; the metrics of this training go into a run of "
+            f"their own, in the project {WANDB_PROJECT!r}"
+        )
+    why = "it is one of a sweep"
+    if not outer.sweep_id:
+        why = f"wandb before {'.'.join(map(str, WANDB_SEVERAL))} has one run at a time"
+    return f"the metrics of this training go into {name}, which stays open: {why}"
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """Return the first three numbers of a version."""
+    return tuple(int(number) for number in re.findall(r"\d+", version)[:3])
 
 
 class MLflow(Tracker):
@@ -159,6 +213,13 @@ class MLflow(Tracker):
         mlflow = importlib.import_module("mlflow")
         self._metric = importlib.import_module("mlflow.entities").Metric
         self._run = run
+        self._keys = mlflow_keys(run.manifest.log_info)
+        changed = [f"{k!r} is {name!r}" for k, name in self._keys.items() if k != name]
+        if changed and not run.finished:
+            notice(
+                "MLflow refuses some letters and lengths in names, so of log_info there "
+                f"{', '.join(changed)}"
+            )
         self._waiting = list[Any]()
         self._sent = list[Any]()
         self._since = time.monotonic()
@@ -203,7 +264,9 @@ class MLflow(Tracker):
         for stage in manifest.stages:
             settings |= flat(stage.algorithm, f"{stage.name}.")
         param = importlib.import_module("mlflow.entities").Param
-        params = [param(k, str(v)[:MLFLOW_LONGEST_SETTING]) for k, v in settings.items()]
+        params = [
+            param(_shortened(k), str(v)[:MLFLOW_LONGEST_SETTING]) for k, v in settings.items()
+        ]
         for i in range(0, len(params), MLFLOW_MOST_SETTINGS):
             self._client.log_batch(created.info.run_id, params=params[i : i + MLFLOW_MOST_SETTINGS])
         return created
@@ -214,12 +277,21 @@ class MLflow(Tracker):
             return
         now = int(1000 * time.time())
         for key, value in (metrics | {"steps": steps}).items():
-            self._waiting.append(self._metric(f"{name}/{key}", float(value), now, steps))
+            self._waiting.append(
+                self._metric(self._name(f"{name}/{key}"), float(value), now, steps)
+            )
         if (
             time.monotonic() - self._since > MLFLOW_SECONDS
             or len(self._waiting) > MLFLOW_MOST_METRICS
         ):
             self._send()
+
+    def _name(self, name: str) -> str:
+        """Return the name of a metric in MLflow."""
+        for key, accepted in self._keys.items():
+            if name.endswith(f"/info/{key}"):
+                return _shortened(name.removesuffix(key) + accepted)
+        return _shortened(name)
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Send waiting metrics."""
@@ -238,18 +310,91 @@ class MLflow(Tracker):
             self._sent.append(self._client.log_batch(self._id, metrics=batch, synchronous=False))
 
     def close(self) -> None:
-        """Send the rest and the run's status; print a message if metrics were refused."""
+        """Send the rest and the run's status; raise the first error of what was refused."""
         status = "FINISHED" if self._run.finished else "KILLED"
-        try:
-            self._send()
-            for sent in self._sent:
+        errors = list[Exception]()
+        self._send()
+        for sent in self._sent:
+            try:
                 sent.wait()
-            self._client.set_terminated(self._id, status)
-        except Exception as error:
-            say(
-                "MLflow did not take all metrics (they are in the run's files): "
-                f"{error_text(error)}"
-            )
+            except Exception as error:  # of any store; the other metrics are sent
+                errors.append(error)
+        self._client.set_terminated(self._id, status)
+        if errors:
+            raise errors[0]
+
+
+def mlflow_keys(keys: Iterable[str]) -> dict[str, str]:
+    """Return for keys of ``info`` what is in their place in MLflow's names, each another one."""
+    names = {key: _accepted(key) for key in keys}
+    used = {key for key, name in names.items() if key == name}
+    for key, name in names.items():
+        if key == name:
+            continue
+        number = 1
+        while names[key] in used:
+            number += 1
+            names[key] = f"{name}_{number}"
+        used.add(names[key])
+    return names
+
+
+def _accepted(key: str) -> str:
+    """Return a key as MLflow takes it: without letters that it refuses, and no path like a/../b."""
+    parts = MLFLOW_REFUSED.sub("_", key)[:MLFLOW_LONGEST_KEY].split("/")
+    return "/".join("_" if part in ("", ".", "..") else part for part in parts)
+
+
+def _shortened(name: str) -> str:
+    """Return a name that is not too long for MLflow; of a long one its end is a checksum."""
+    if len(name) <= MLFLOW_LONGEST_NAME:
+        return name
+    return f"{name[: MLFLOW_LONGEST_NAME - 9]}_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+
+
+class Guarded(Tracker):
+    """A tracker whose errors end no training: a notice gives the first one.
+
+    Args:
+        name: of the tracker, for the notice.
+        tracker: receives the events.
+    """
+
+    def __init__(self, name: str, tracker: Tracker) -> None:
+        self._name = name
+        self._tracker = tracker
+        self._failed = False
+
+    def _attempt(self, function: Callable[..., None], *values: Any) -> None:
+        try:
+            function(*values)
+        except Exception as error:  # of any tracker: no network, a full disk, a closed run
+            if not self._failed:
+                notice(
+                    f"{self._name} did not take everything ({error_text(error)}); all metrics are "
+                    "in the run's files"
+                )
+            self._failed = True
+
+    def stage(self, name: str, budget: int) -> None:
+        """Forward it."""
+        self._attempt(self._tracker.stage, name, budget)
+
+    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """Forward it."""
+        self._attempt(self._tracker.tick, name, steps, seconds, metrics)
+
+    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """Forward it."""
+        self._attempt(self._tracker.done, name, steps, seconds, metrics)
+
+    def film(self, path: Path, steps: int) -> None:
+        """Forward it."""
+        self._attempt(self._tracker.film, path, steps)
+
+    def close(self) -> None:
+        """Forward it."""
+        self._attempt(self._tracker.close)
 
 
 def identifier(run: RunDirectory) -> str:
@@ -280,20 +425,34 @@ def make_trackers(names: Sequence[str], run: RunDirectory | None) -> tuple[Track
             raise DeclarationError(f"no tracker {name!r}{suggest(name, TRACKERS)}")
         if importlib.util.find_spec(name) is None:
             raise MissingExtra(f"tracking with {name}", name)
-    return () if run is None else tuple(MAKE[name](run) for name in names)
+    if run is None:
+        return ()
+    trackers = list[Tracker]()
+    for name in names:
+        try:
+            trackers.append(Guarded(name, MAKE[name](run)))
+        except BaseException:
+            for tracker in trackers:
+                tracker.close()
+            raise
+    return tuple(trackers)
 
 
 @contextmanager
 def trackers_of(run: RunDirectory) -> Iterator[tuple[Tracker, ...]]:
     """Yield the trackers of a run's training, to send later results.
 
-    None if they are not installed: the run was trained on another machine.
+    None if they are not installed: the run was trained on another machine. Or if one does not
+    answer, which a notice says: the results are in the run's files.
     """
     with ExitStack() as stack:
+        trackers: tuple[Tracker, ...] = ()
         try:
             trackers = make_trackers(run.manifest.track, run)
         except MissingExtra:
-            trackers = ()
+            pass
+        except RunError as error:
+            notice(str(error))
         for tracker in trackers:
             stack.callback(tracker.close)
         yield trackers

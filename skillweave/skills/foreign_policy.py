@@ -162,7 +162,7 @@ class Source:
     """Its mapping from observations to actions, if it has one."""
 
     def __str__(self) -> str:
-        sha256 = "" if self.sha256 is None else f" (sha256 {self.sha256[:12]}…)"
+        sha256 = "" if self.sha256 is None else f" (sha256 {self.sha256[:12]}...)"
         return f"{self.kind} {(self.file or self.name or '')[:300]}{sha256}"
 
 

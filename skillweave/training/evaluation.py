@@ -254,7 +254,7 @@ class Evaluation:
             mean, std, low, high, iqm = (
                 f"{value:.{digits}f}" for value in (self.mean, j["std"], *j["ci95"], j["iqm"])
             )
-            line = f"{mean} ± {std} over {n} episodes (95 % CI {low} to {high}, IQM {iqm})"
+            line = f"{mean} +/- {std} over {n} episodes (95 % CI {low} to {high}, IQM {iqm})"
         if self.solved_fraction is not None:
             line += f", {self.solved_fraction:.0%} at {self.threshold:g} or more"
         if self.success_rate is not None:

@@ -266,11 +266,11 @@ TITLES = ("skill", "share", "calls", "length", *ENDS.values(), "success", "retur
 
 
 def _percent(value: float | None) -> str:
-    return "–" if value is None else f"{value:.0%}"
+    return "-" if value is None else f"{value:.0%}"
 
 
 def _number(value: float | None, scale: float | None = None) -> str:
-    return "–" if value is None else f"{value:,.1f}"
+    return "-" if value is None else f"{value:,.1f}"
 
 
 Words = tuple[Callable[[float | None], str], Callable[..., str], str]

@@ -636,8 +636,46 @@ MISTAKES: dict[str, tuple[list[str], int, list[str]]] = {
     "option": (["train", "PLAIN", "--sed", "3"], 2, ["--sed", "--seed"]),
     "option's type": (["train", "PLAIN", "--seed", "three"], 2, ["--seed", "three"]),
     "tracker": (["train", "PLAIN", "--track", "wandbee"], 2, ["wandbee", "wandb"]),
+    "environment": (["train", "CartPole-v1"], 1, ["is an environment", "sw.Hierarchy("]),
+    "environment's policy": (["evaluate", "ALE/Pong-v5"], 1, ["an environment", "FILE.py"]),
+    "settings' file": (["train", "config.yaml"], 1, ["--set NAME=VALUE"]),
+    "steps": (["train", "PLAIN", "--total-timesteps", "9"], 2, ["--set steps=N"]),
+    "steps with =": (["train", "PLAIN", "--total_timesteps=9"], 2, ["--set steps=N"]),
+    "device": (["train", "PLAIN", "--device", "cuda"], 2, ["--set selector.device=VALUE"]),
+    "environments": (["train", "PLAIN", "--n-envs", "4"], 2, ["--set selector.num_envs=VALUE"]),
+    "rate": (["train", "PLAIN", "--lr", "1"], 2, ["--set selector.learning_rate=VALUE"]),
+    "seeds": (["train", "PLAIN", "--seeds", "1"], 2, ["skillweave sweep RECIPE --seeds 0:5"]),
+    "env": (["train", "--env", "CartPole-v1"], 2, ["skillweave train FILE.py"]),
+    "enjoy": (["enjoy", "RUN"], 2, ["no command 'enjoy': write evaluate"]),
+    "version": (["version"], 2, ["skillweave --version"]),
+    "long name": (["evaluate", "a" * 300], 1, ["target is", "too long"]),
+    "long names": (["compare", "a" * 300, "b"], 1, ["runs is", "too long"]),
+    "long recipe": (["info", "a" * 300], 1, ["target is", "too long"]),
     "nothing to train": (["train"], 2, ["Missing", "A shipped recipe"]),
 }
+
+
+def test_what_a_message_says_to_write_instead_works(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    words = (
+        "--set",
+        "steps=512",
+        "--set",
+        "selector.num_envs=2",
+        "--set",
+        "skills.left.num_envs=2",
+    )
+    words += ("--set", "selector.device=cpu", "--set", "skills.left.device=cpu")
+    words += ("--set", "selector.learning_rate=0.01", "--set", "train.eval_every=256")
+    answer = call("train", trained.plain, "-o", tmp_path / "run", *words, *QUIET, "--json")
+    assert 500 <= sum(stage["steps"] for stage in answer.json["stages"]) <= 700
+    (tmp_path / "three.py").write_text(
+        "import skillweave as sw\n"
+        "class Move(sw.Skill): max_steps = 20\n"
+        'hierarchy = sw.Hierarchy("CartPole-v1", [Move()], steps=100_000)\n'
+    )
+    call("train", tmp_path / "three.py", "-o", tmp_path / "three", "--scale", 0.01, *QUIET)
 
 
 @pytest.mark.parametrize(("arguments", "code", "said"), MISTAKES.values(), ids=MISTAKES.keys())

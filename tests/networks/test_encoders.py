@@ -115,7 +115,7 @@ def test_the_usual_network_depends_on_the_size(height, width, chosen, size):
 def test_an_image_that_is_too_small_is_an_error_that_names_sizes():
     with pytest.raises(DeclarationError) as error:
         ImageEncoder(obs_codec(image_space(20, 24)), 0, CNN(), "relu")
-    for said in ("(3, 20, 24)", "layer 2 has a kernel of 3", "only 1×1 are left", "CNN.small()"):
+    for said in ("(3, 20, 24)", "layer 2 has a kernel of 3", "only 1 x 1 are left", "CNN.small()"):
         assert said in str(error.value)
 
 

@@ -29,7 +29,7 @@ def test_the_chance_is_that_of_the_logged_calls(share):
     assert expected.calls == (("a", 2.0), ("b", 1.0))
     assert expected.steps == 3
     assert ("-1" in expected.reason or "state" in expected.reason) == (share < 0.2)
-    assert str(expected).startswith("a (2 steps) → b (1 steps): a chance of ")
+    assert str(expected).startswith("a (2 steps) -> b (1 steps): a chance of ")
 
 
 def test_few_starts_make_a_wide_interval():

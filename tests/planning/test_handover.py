@@ -67,7 +67,7 @@ def test_it_is_shown_as_a_table(log):
     lines = str(log.handover()).splitlines()
     assert lines[0].split() == ["after", "go", "stay"]
     assert lines[2].split("  ")[-1].strip() == "50% of 2 (9% to 91%)"
-    assert lines[3].split()[-1] == "–"
+    assert lines[3].split()[-1] == "-"
     assert "<table>" in log.handover()._repr_html_()
 
 

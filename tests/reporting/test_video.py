@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import os
 import subprocess
@@ -428,3 +429,66 @@ def test_a_film_shows_what_an_evaluation_plays(tmp_path):
     ]  # fmt: skip
     assert told[0] == told[1]
     assert len(told[0]) == 7
+
+
+class Full:
+    """A file on a full disk: it takes 2 kB."""
+
+    def __init__(self, file: Any) -> None:
+        self.file = file
+        self.left = 2_000
+
+    def __enter__(self) -> Full:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.file.close()
+
+    def write(self, data: bytes) -> None:
+        self.left -= len(data)
+        if self.left < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self.file.write(data)
+
+    def writelines(self, lines: Any) -> None:
+        for line in lines:
+            self.write(line)
+
+
+@pytest.mark.parametrize("frames", [1, 5, 50])
+def test_a_gif_on_a_full_disk_is_an_error_of_the_library_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frames: int
+) -> None:
+    path = tmp_path / "film.gif"
+    path.write_bytes(b"an earlier film")
+    real = Path.open
+    monkeypatch.setattr(Path, "open", lambda self, mode: Full(real(self, mode)))
+    noise = np.random.default_rng(0).integers(0, 255, (frames, *SIZE, 3)).astype(np.uint8)
+
+    def write() -> None:
+        with VideoWriter(path, 10) as video:
+            for frame in noise:
+                video.add(frame)
+
+    with pytest.raises(RunError, match=r"could not write .*film\.gif: No space left"):
+        write()
+    monkeypatch.undo()
+    assert [p.name for p in tmp_path.iterdir()] == ["film.gif"]
+    assert path.read_bytes() == b"an earlier film"
+
+
+@pytest.mark.parametrize("name", ["film.gif", "film.mp4"])
+def test_a_film_below_a_file_is_an_error_of_the_library(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(RunError, match="could not write"):
+        VideoWriter(tmp_path / "file" / name, 10)
+
+
+def test_an_error_of_the_environment_stays_its_own(tmp_path: Path) -> None:
+    def write() -> None:
+        with VideoWriter(tmp_path / "film.gif", 10):
+            raise FileNotFoundError("a mesh of the environment")
+
+    with pytest.raises(FileNotFoundError, match="a mesh"):
+        write()
+    assert list(tmp_path.iterdir()) == []

@@ -25,7 +25,7 @@ from skillweave.algorithms.policy import AgentHeader, AgentPolicy, make_algorith
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
+from skillweave.runs.files import read_header, read_json, read_tensors, write_json, write_tensors
 from skillweave.runs.manifest import (
     BestEntry,
     Checkpoint,
@@ -717,3 +717,30 @@ def test_a_populations_checkpoint_without_one_of_its_fields_is_refused(
     write_tensors(path, tensors, header)
     with pytest.raises(RunError, match=f"damaged: population has no field '{field}'"):
         run.load_checkpoint("landing")
+
+
+def test_a_folder_that_is_no_utf8_is_refused_before_training(tmp_path: Path) -> None:
+    strange = tmp_path / os.fsdecode(b"x\xff\xfe")
+    try:
+        strange.mkdir()
+        strange.rmdir()
+    except OSError:
+        pytest.skip("this file system has no such names")
+    for path in (strange, strange / "run"):
+        with pytest.raises(RunError, match=r"is not UTF-8.*choose another folder"):
+            RunDirectory.create(path, small_manifest())
+    assert list(tmp_path.iterdir()) == []
+    good = RunDirectory.create(tmp_path / "größe → 大", small_manifest())
+    assert (good.path / "run.json").is_file()
+
+
+def test_weights_in_a_folder_that_is_no_utf8_are_not_said_to_be_damaged(tmp_path: Path) -> None:
+    strange = tmp_path / os.fsdecode(b"x\xff\xfe")
+    write_tensors(tmp_path / "a.safetensors", {}, {})
+    try:
+        (tmp_path / "a.safetensors").rename(strange)
+    except OSError:
+        pytest.skip("this file system has no such names")
+    for act in (read_header, read_tensors, lambda path: write_tensors(path, {}, {})):
+        with pytest.raises(RunError, match="is not UTF-8"):
+            act(strange)

@@ -146,11 +146,24 @@ def test_links_of_a_tracker_within_its_own_folder_are_no_links_of_others(runs, t
     (run / "wandb" / "offline-run-1" / "logs").mkdir(parents=True)
     (run / "wandb" / "latest-run").symlink_to("offline-run-1")
     (run / "wandb" / "debug.log").symlink_to("offline-run-1/logs/debug.log")
+    # W&B's own log outside, to which nothing is written later.
+    (run / "wandb" / "offline-run-1" / "logs" / "debug-core.log").symlink_to(tmp_path / "core.log")
     declared().train(run, resume=True, quiet=True)
     (run / "wandb" / "latest-run").unlink()
     (run / "wandb" / "latest-run").symlink_to("../..")
     with pytest.raises(RunError, match="latest-run is a link to"):
         declared(2 * STEPS).train(run, resume=True, quiet=True)
+
+
+@pytest.mark.parametrize(
+    "name", ["wandb", "wandb/debug-core.log", "wandb/r/debug-core.log", "wandb/r/logs/other.log"]
+)
+def test_other_links_in_the_folder_of_a_tracker_are_refused(runs, tmp_path, mine, name):
+    run = shutil.copytree(runs / "stopped", tmp_path / "run")
+    (run / name).parent.mkdir(parents=True, exist_ok=True)
+    (run / name).symlink_to(mine)
+    with pytest.raises(RunError, match="is a link to"):
+        declared().train(run, resume=True, quiet=True)
 
 
 @pytest.mark.parametrize("kind", ["pipe", "socket"])

@@ -321,7 +321,7 @@ def test_a_skill_that_learns_on_alone_makes_its_selector_old_and_it_is_said(
     run = with_skill(256).train(path, resume=True)
     assert [n for n, e in stages(run).items() if e.continued] == ["left"]
     told = capfd.readouterr().err
-    assert "left continues: 128 → 256 steps" in told
+    assert "left continues: 128 -> 256 steps" in told
     assert "selector stays as it is, so it still chooses for left as they were" in told
 
 

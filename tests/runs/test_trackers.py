@@ -6,15 +6,23 @@ import importlib.util
 import os
 import subprocess
 import sys
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 from small_runs import small_manifest, stage_entry
 
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import MissingExtra, RunError, SkillweaveError
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.trackers import TRACKERS, make_trackers, track_film, trackers_of
+from skillweave.runs.trackers import (
+    TRACKERS,
+    make_trackers,
+    mlflow_keys,
+    track_film,
+    trackers_of,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
@@ -111,6 +119,7 @@ def test_a_resumed_run_goes_on_in_the_same_run_of_wandb(
 ) -> None:
     wandb = pytest.importorskip("wandb")
     asked: list[dict[str, Any]] = []
+    monkeypatch.setattr(wandb, "run", None)
     monkeypatch.setattr(wandb, "init", lambda **how: asked.append(how))
     make_trackers(("wandb",), run)
     make_trackers(("wandb",), RunDirectory(run.path, run.manifest))
@@ -119,6 +128,150 @@ def test_a_resumed_run_goes_on_in_the_same_run_of_wandb(
     first, again, other = asked
     assert first["id"] == again["id"] != other["id"]
     assert first["resume"] == again["resume"] == "allow"
+
+
+class FakeRun:
+    """A run of W&B, as far as the tracker uses it."""
+
+    def __init__(self, **how: Any) -> None:
+        self.how = how
+        self.id, self.name, self.sweep_id = how.get("id", "x"), how.get("name"), None
+        self.logged: list[dict[str, Any]] = []
+        self.finished = False
+
+    def define_metric(self, name: str, step_metric: str) -> None:
+        pass
+
+    def log(self, values: dict[str, Any]) -> None:
+        assert not self.finished
+        self.logged.append(values)
+
+    def finish(self) -> None:
+        self.finished = True
+
+
+@pytest.fixture
+def wandb(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A package that has ``made`` the runs that were asked for, and ``run``, the program's own."""
+    fake: Any = ModuleType("wandb")
+    fake.__spec__ = ModuleSpec("wandb", None)
+    fake.__version__ = "0.21.0"
+    fake.run, fake.made = None, []
+    fake.Settings = lambda **how: how
+
+    def init(**how: Any) -> FakeRun:
+        if fake.run is not None and how.get("reinit") != "create_new":
+            return fake.run
+        fake.made.append(FakeRun(**how))
+        return fake.made[-1]
+
+    fake.init = init
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    return fake
+
+
+def track(run: RunDirectory) -> None:
+    (tracker,) = make_trackers(("wandb",), run)
+    tracker.stage("landing", 1000)
+    tracker.tick("landing", 128, 0.5, {"return": 1.5})
+    tracker.close()
+
+
+def unfinished(run: RunDirectory) -> RunDirectory:
+    run.manifest.stages = [stage_entry("landing", "training", steps=128)]
+    return run
+
+
+def test_a_run_of_the_programs_own_in_wandb_stays_as_it_is(run: RunDirectory, wandb: Any) -> None:
+    wandb.run = FakeRun(name="mine")
+    for _ in range(2):  # the second time it is resumed
+        with pytest.warns(UserWarning, match="the W&B run 'mine' is open and stays as it is"):
+            track(unfinished(run))
+    assert not wandb.run.finished
+    assert wandb.run.logged == []
+    first, again = wandb.made
+    assert first.how["id"] == again.how["id"]
+    assert first.finished
+    assert first.logged == [{"landing/return": 1.5, "landing/steps": 128}]
+
+
+def test_a_run_of_a_sweep_gets_the_metrics_and_stays_open(run: RunDirectory, wandb: Any) -> None:
+    wandb.run = FakeRun(name="mine")
+    wandb.run.sweep_id = "s"
+    with pytest.warns(UserWarning, match="go into the W&B run 'mine', which stays open.*a sweep"):
+        track(unfinished(run))
+    assert wandb.made == []
+    assert wandb.run.logged == [{"landing/return": 1.5, "landing/steps": 128}]
+    assert not wandb.run.finished
+
+
+def test_an_old_wandb_that_has_one_run_at_a_time_leaves_it_open(
+    run: RunDirectory, wandb: Any
+) -> None:
+    wandb.run, wandb.__version__ = FakeRun(name="mine"), "0.19.9"
+    with pytest.warns(UserWarning, match=r"'mine', which stays open: wandb before 0\.19\.10"):
+        track(unfinished(run))
+    assert len(wandb.run.logged) == 1
+    assert not wandb.run.finished
+
+
+@pytest.mark.filterwarnings("error")
+def test_without_a_run_of_the_programs_own_nothing_is_said(run: RunDirectory, wandb: Any) -> None:
+    track(unfinished(run))
+    (made,) = wandb.made
+    assert made.finished
+    assert "reinit" not in made.how
+
+
+def test_a_tracker_that_fails_ends_no_training(tmp_path: Path, wandb: Any) -> None:
+    from skillweave import PPO, Network, train_agent
+
+    def fail(self: FakeRun, values: dict[str, Any]) -> None:
+        raise ConnectionError("the network is gone")
+
+    small = PPO(num_envs=2, n_steps=8, batch_size=16, network=Network((4,)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FakeRun, "log", fail)
+        patch.setattr(FakeRun, "finish", fail)
+        with pytest.warns(UserWarning, match="wandb did not take everything.*network is gone") as w:
+            trained = train_agent(
+                "CartPole-v1", small, 64, tmp_path / "run", quiet=True, track=["wandb"]
+            )
+    assert len([one for one in w if "did not take" in str(one.message)]) == 1
+    steps = [line["steps"] for line in RunDirectory.open(trained.path).metrics()]
+    assert steps == [16, 32, 48, 64]
+
+
+def test_a_score_is_kept_where_a_tracker_does_not_answer(tracked: RunDirectory, wandb: Any) -> None:
+    from skillweave.training.evaluation import Evaluation
+    from skillweave.training.evaluation_file import load_evaluation, save_evaluation
+
+    def fail(**how: Any) -> FakeRun:
+        raise ConnectionError("no server")
+
+    wandb.init = fail
+    tracked.manifest.track = ("tensorboard", "wandb")
+    with pytest.raises(RunError, match=r"W&B does not answer.*no server.*WANDB_MODE=offline"):
+        make_trackers(("wandb",), tracked)
+    with pytest.warns(UserWarning, match="W&B does not answer"):
+        save_evaluation(tracked, Evaluation((1.0,), (20,), None, {}), 0, True)
+    assert load_evaluation(tracked) is not None
+
+
+def test_names_that_mlflow_refuses_are_replaced_each_by_another_one() -> None:
+    fine = {"plain": "plain", "a: b": "a: b", "größe": "größe", "a/b.c": "a/b.c", "a_": "a_"}
+    if os.name == "nt":
+        fine.pop("a: b")
+    assert mlflow_keys(fine) == fine
+    keys = ["a%", "a@", "a_", "vel[x]", "/a//b/../c", "", "x" * 300, "x" * 301]
+    names = mlflow_keys(keys)
+    assert names["a_"] == "a_"
+    assert names["a%"] == "a__2"
+    assert names["a@"] == "a__3"
+    assert names["vel[x]"] == "vel_x_"
+    assert names["/a//b/../c"] == "_/a/_/b/_/c"
+    assert len(set(names.values())) == len(keys)
+    assert max(map(len, names.values())) < 110
 
 
 @pytest.fixture
@@ -273,6 +426,36 @@ def test_mlflow_goes_on_in_the_same_run_and_shows_each_step_once(
     content = small_manifest()
     make_trackers(("mlflow",), RunDirectory.create(tmp_path / "other", content))[0].close()
     assert len(client.search_runs([experiment])) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_all_metrics_are_in_mlflow_where_it_refuses_a_name(
+    run: RunDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mlflow = pytest.importorskip("mlflow")
+    uri = f"sqlite:///{tmp_path}/mlflow.db"
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+    monkeypatch.chdir(tmp_path)
+    keys = ("plain", "vel[x]", "vel(x)", "x" * 300, "../up")
+    run.manifest.log_info = keys
+    deep = "/".join(["a" * 64] * 5)
+    run.manifest.stages = [stage_entry(deep, "training", steps=300)]
+    run.manifest.stages[0].algorithm["gamma"] = 0.9
+    with pytest.warns(UserWarning, match=r"'vel\[x\]' is 'vel_x_', 'vel\(x\)' is 'vel_x__2'"):
+        (tracker,) = make_trackers(("mlflow",), run)
+    values = {f"info/{key}": float(i) for i, key in enumerate(keys)}
+    tracker.tick(deep, 100, 1.0, values)
+    tracker.tick("landing", 100, 1.0, values | {"nan": float("nan"), "inf": float("inf")})
+    tracker.close()
+    client = mlflow.MlflowClient(uri)
+    experiment = client.get_experiment_by_name("skillweave").experiment_id
+    (found,) = client.search_runs([experiment])
+    metrics = found.data.metrics
+    assert metrics["landing/info/vel_x_"] == 1
+    assert metrics["landing/info/vel_x__2"] == 2
+    assert metrics["landing/info/_/up"] == 4
+    assert len(metrics) == 6 + 8
 
 
 @pytest.mark.slow

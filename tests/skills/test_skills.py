@@ -256,7 +256,7 @@ def test_attributes_of_another_kind_are_told(attribute, value, says):
 
 
 def test_long_values_are_shortened_and_what_cannot_be_shown_is_named():
-    assert short("x" * 10_000, 20) == "'xxxxxxxxx … xxxxxxxxx'"
+    assert short("x" * 10_000, 20) == "'xxxxxxxxx ... xxxxxxxxx'"
     assert short([1, 2]) == "[1, 2]"
 
     class Shy:

@@ -283,15 +283,15 @@ def test_the_summary_is_strict_json_and_the_line_says_it():
     found = evaluate(woven(), EnvSpec(Line), episodes=3)
     assert json.loads(json.dumps(found.to_json(), allow_nan=False)) == found.to_json()
     line = str(evaluation((100.0, 300.0), (50, 150), 200.0))
-    assert "200.0 ± 141.4 over 2 episodes" in line
+    assert "200.0 +/- 141.4 over 2 episodes" in line
     assert "50% at 200 or more" in line
     assert "100 steps an episode" in line
 
 
 def test_small_returns_have_digits_enough_to_tell_them_apart():
     line = str(evaluation((0.96, 1.0)))
-    assert "0.98 ± 0.03 over 2 episodes (95 % CI 0.94 to 1.02, IQM 0.98)" in line
-    assert "9.4 ± 9.2 over 2 episodes" in str(evaluation((2.9, 15.9)))
+    assert "0.98 +/- 0.03 over 2 episodes (95 % CI 0.94 to 1.02, IQM 0.98)" in line
+    assert "9.4 +/- 9.2 over 2 episodes" in str(evaluation((2.9, 15.9)))
 
 
 def test_the_threshold_is_the_environments_own():

@@ -179,7 +179,7 @@ def test_the_table_for_people():
     assert skill_table(some).splitlines() == [
         "skill  share  calls  length  own  limit  interrupted  episode  success  return",
         "go       75%  1,200     2.5  25%    75%           0%       0%      50%    -1.5",
-        "stand    25%      0       –    –      –            –        –        –       –",
+        "stand    25%      0       -    -      -            -        -        -       -",
     ]
     both = replace(some["go"], own_with_episode=120)
     assert skill_rows({"go": both})[0]["ends"][0] == "25% (10% last step)"
@@ -456,7 +456,7 @@ def test_of_a_policy_that_is_no_hierarchy_only_steps_and_calls_are_known():
     high = SkillReport(sum(found.lengths), calls, {}, None, None)
     assert found.skills == {"low": SkillReport(0, 0, {}, None, None), "high": high}
     assert (high.success_rate, high.return_mean) == (None, None)
-    assert "–" in found.for_people()
+    assert " - " in found.for_people()
 
 
 def test_a_plain_policy_has_no_table():
