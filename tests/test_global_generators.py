@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import random
 import threading
-import threading
 import warnings
 
 import gymnasium as gym

@@ -7,8 +7,9 @@ from generators of their own.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -18,9 +19,6 @@ from skillweave.envs.infos import allowed_rows, random_actions
 from skillweave.errors import SkillweaveError
 from skillweave.types import Array
 
-if TYPE_CHECKING:
-    from skillweave.envs.engine import GymnasiumEngine
-
 FIRST_STEPS = 5
 """Steps of an episode before training."""
 LAST_STEPS = 50
@@ -29,11 +27,41 @@ PATIENCE = 1.0
 """Seconds of an episode after which environments are too slow for more of them."""
 END = "EnvSpec(..., check_seed=False) ends this message"
 
+
+class Checked(Protocol):
+    """The engine whose environments are checked."""
+
+    name: str
+    num_envs: int
+    action_space: Any
+    draws_globally: bool
+
+    def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
+        """Reset environments ``ids`` (n,) to seeds; return observations (n, …)."""
+        ...
+
+    def act(self, action: Array, ids: Array) -> Any:
+        """Return the ``RawStep`` of environments ``ids`` (n,), which is not counted."""
+        ...
+
+    def mask(self) -> Array | None:
+        """Return the actions allowed now, (N, A) bool; None: all."""
+        ...
+
+    def numbers(self, obs: Array) -> list[Array]:
+        """Return copies of observations (n, …) as arrays of numbers."""
+        ...
+
+    def renew(self) -> None:
+        """Close the environments, and make a new one in their place."""
+        ...
+
+
 Outcome = list[list[Array]]
 """The numbers of each step, and of the reset before it."""
 
 
-def check_first_steps(engine: GymnasiumEngine) -> None:
+def check_first_steps(engine: Checked) -> None:
     """Give a notice where environment 0 does not repeat itself, alone or beside environment 1."""
     began = time.monotonic()
     alone = _play(engine, FIRST_STEPS)
@@ -68,7 +96,7 @@ def check_first_steps(engine: GymnasiumEngine) -> None:
         )
 
 
-def check_used(engine: GymnasiumEngine) -> None:
+def check_used(engine: Checked) -> None:
     """Give a notice where environment 0, which has been used, acts otherwise than a new one.
 
     Afterwards the engine can only be closed.
@@ -102,7 +130,7 @@ def check_used(engine: GymnasiumEngine) -> None:
 
 
 def _play(
-    engine: GymnasiumEngine,
+    engine: Checked,
     steps: int,
     seconds: float = np.inf,
     *,
@@ -139,7 +167,7 @@ def _play(
     return outcome
 
 
-def _step(engine: GymnasiumEngine, row: Array, rng: np.random.Generator) -> Any:
+def _step(engine: Checked, row: Array, rng: np.random.Generator) -> Any:
     mask = allowed_rows(engine.mask(), row)
     return engine.act(random_actions(engine.action_space, 1, rng, mask), row)
 
