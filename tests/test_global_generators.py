@@ -15,6 +15,7 @@ import torch
 from safetensors.torch import load_file
 
 import skillweave as sw
+from skillweave._internal.seeding import Seeds, global_generators
 
 # A quiet run says it as a Python warning.
 pytestmark = pytest.mark.filterwarnings("ignore:.* draws from ")
@@ -115,7 +116,8 @@ def test_environments_that_draw_when_they_are_made_differ_between_processes(tmp_
             if multiprocessing.parent_process() is not None:
                 (tmp_path / f"{os.getpid()}-{self.length}").touch()
 
-    train(Built, tmp_path / "run", workers=2)
+    spec = sw.EnvSpec(Built, engine="sync", workers=2, check_seed=False)
+    sw.train_agent(spec, SMALL, 128, tmp_path / "run", quiet=True)
     lengths = [f.name.split("-")[1] for f in tmp_path.iterdir() if "-" in f.name]
     assert len(lengths) == len(set(lengths)) == 4
 
@@ -276,3 +278,25 @@ def test_an_evaluation_alone_says_nothing_of_resuming(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sw.evaluate(run.policy, drawing("random"), episodes=2)
+
+
+def test_threads_that_share_a_generator_are_promised_nothing(tmp_path, capsys):
+    plays, over = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with global_generators(Seeds(1)):
+            plays.set()
+            over.wait(60)
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    assert plays.wait(60)
+    for name in ("numpy.random", "none"):
+        spec = sw.EnvSpec(drawing(name), engine="sync", workers=1)
+        sw.train_agent(spec, SMALL, 64, tmp_path / name)
+        said = capsys.readouterr().err
+        shared = f"several threads train or play, and their environments draw from {name}"
+        assert (shared in said) == (name != "none")
+        assert "gives the same weights" not in said
+    over.set()
+    thread.join()

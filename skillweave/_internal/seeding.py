@@ -69,6 +69,8 @@ class Seeds:
 
 def seed_global_generators(seeds: Seeds) -> None:
     """Seed ``random``, ``numpy.random`` and torch's generator of the CPU."""
+    global _changes
+    _changes += 1
     python, numpy, of_torch = seeds.integers(3)
     random.seed(python)
     np.random.seed(numpy)  # noqa: NPY002
@@ -93,6 +95,7 @@ class _Blocks(threading.local):
 _blocks = _Blocks()
 _lock = threading.Lock()
 _threads = 0  # in a block
+_changes = 0  # of the generators, by this module
 _users: dict[str, Any] = {}  # the states before the first of them began
 
 
@@ -124,6 +127,8 @@ def global_generators(seeds: Seeds) -> Iterator[None]:
 
 
 def _set_states(states: dict[str, Any]) -> None:
+    global _changes
+    _changes += 1
     random.setstate(states["random"])
     np.random.set_state(states["numpy.random"])  # noqa: NPY002
     if "torch" in states:
@@ -142,6 +147,11 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_threads)
 
 
+def are_shared() -> bool:
+    """Return whether several threads train or play, so that another one may have drawn, too."""
+    return _threads > 1
+
+
 class GlobalDraws:
     """A detector of draws from global generators, in the first ``looks`` checks."""
 
@@ -149,15 +159,16 @@ class GlobalDraws:
         self.looks = looks
         """The remaining checks."""
         self._before: dict[str, bytes] = {}
+        self._changes = 0
 
     def begin(self) -> None:
         """Store the states of the generators."""
-        self._before = _fingerprints()
+        self._before, self._changes = _fingerprints(), _changes
 
     def end(self) -> list[str]:
         """Return the modules whose generators were drawn from since ``begin``."""
         self.looks -= 1
-        if _threads > 1:  # another thread may have drawn
+        if _changes != self._changes:  # another thread has seeded them
             return []
         now = _fingerprints()
         return [name for name, before in self._before.items() if now[name] != before]

@@ -23,10 +23,11 @@ import numpy as np
 
 from skillweave._internal.messages import short
 from skillweave._internal.notices import are_collected, notice
-from skillweave._internal.seeding import GlobalDraws, Seeds, global_generators
+from skillweave._internal.seeding import GlobalDraws, are_shared
 from skillweave.envs.checks import Watch, time_limit
 from skillweave.envs.history import History
-from skillweave.envs.infos import ActionMasks, allowed_rows, random_actions, time_limits
+from skillweave.envs.infos import ActionMasks, time_limits
+from skillweave.envs.repeats import check_first_steps, check_used
 from skillweave.errors import EnvError, SkillweaveError, reworded
 from skillweave.policies.infos import InfoKeys, batched_infos
 from skillweave.policies.spaces import space_of
@@ -34,7 +35,8 @@ from skillweave.skills.outputs import keys_of
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, Step
 
-LOOKS = 12
+OWN_GENERATOR = "self.np_random instead, which super().reset(seed=seed) seeds"
+LOOKS = 40
 """Resets and steps in which draws from global generators are detected."""
 
 
@@ -111,6 +113,10 @@ class Engine(Protocol):
         """Return the actions allowed in the latest observations, (N, A) bool; None: always all."""
         ...
 
+    def finish(self) -> None:
+        """Check at the end of training what it has left in the environments, before ``close``."""
+        ...
+
     def close(self) -> None:
         """Release processes and memory."""
         ...
@@ -139,7 +145,7 @@ class WatchedEngine:
         self.observation_space: gym.Space[Any] = env.observation_space
         self.action_space: gym.Space[Any] = copy.deepcopy(env.action_space)  # seeded by others
         self.time_limit = time_limit(env)
-        self._name = name
+        self.name = name
         self._all = np.arange(num_envs)
         self._root = 0
         self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
@@ -160,11 +166,14 @@ class WatchedEngine:
         """Return the actions allowed in the latest observations, (N, A) bool; None: always all."""
         return self._masks.now
 
+    def finish(self) -> None:
+        """Check nothing."""
+
     def close(self) -> None:
         """Give a notice of keys of info that were read, and that no environment has given."""
         for key in sorted(self._keys.asked):
             notice(
-                f"{self._name}: no environment set info[{short(key)}], which is read: 0 stood in "
+                f"{self.name}: no environment set info[{short(key)}], which is read: 0 stood in "
                 f"its place (the keys are: {keys_of(self._keys.examples)})"
             )
 
@@ -223,9 +232,12 @@ class GymnasiumEngine(WatchedEngine):
         env = self.envs[0]
         super().__init__(env, num_envs, name, first, env.observation_space)
         self._check_seed = check_seed and first == 0
+        self._make, self._started = make, False
         self.trains = False
         """Learners learn from these environments."""
         self._draws = GlobalDraws(LOOKS if are_collected() else 0)
+        self.draws_globally = False
+        """They have drawn from global generators."""
         self._dtype = obs_dtype(env.observation_space)
         self._shape = obs_shape(env.observation_space)
         self._action_dtype = obs_dtype(self.action_space)
@@ -237,8 +249,9 @@ class GymnasiumEngine(WatchedEngine):
 
     def reset(self, seed: int) -> Array:
         """Reset all environments from one seed; return observations (N, *obs_shape)."""
-        if self.trains and self._check_seed:
-            self._check_repeats()
+        if self.trains and self._check_seed and not self._started:
+            self._started = True
+            check_first_steps(self)
         self._root = seed
         self._episode[:] = 0
         return self.reset_some(self._all)
@@ -333,39 +346,43 @@ class GymnasiumEngine(WatchedEngine):
         paid = reward.astype(np.float32)
         return self._stepped(RawStep(obs, paid, terminated, truncated, batched_infos(infos)), ids)
 
-    def _check_repeats(self) -> None:
-        """Give a notice if a seed and an action have two outcomes in environment 0."""
-        self._check_seed = False
-        row = self._all[:1]
-        outcomes = []
-        for _ in range(2):
-            with global_generators(Seeds(0) / "check"):
-                obs = self.reset_some(row, [0])
-                mask = allowed_rows(self.mask(), row)
-                rng = np.random.default_rng(0)
-                raw = self._act(random_actions(self.action_space, 1, rng, mask), row)
-            numbers = obs, raw.next_obs, raw.reward, raw.terminated, raw.truncated
-            outcomes.append([part for array in numbers for part in _parts(array)])
-        # Physics engines do not repeat the last digits. Global draws have their own notice.
-        pairs = zip(*outcomes, strict=True)
-        same = all(np.allclose(a, b, 1e-4, 1e-6, equal_nan=True) for a, b in pairs)
-        if self._draws.looks and not same:
-            notice(
-                f"{self._name}: two resets with the same seed, each with the same first action, "
-                "had different results, so the same seed may give other weights. Draw from "
-                "self.np_random alone, which super().reset(seed=seed) seeds, and let reset() clear "
-                "all state; EnvSpec(..., check_seed=False) ends this message"
-            )
+    def finish(self) -> None:
+        """Check that training has left nothing in the environments; only ``close`` follows."""
+        if self.trains and self._check_seed:
+            check_used(self)
+
+    def act(self, action: Array, ids: Array) -> RawStep:
+        """Step environments ``ids`` (n,), for a check: the steps are not counted."""
+        return self._act(action, ids)
+
+    def numbers(self, obs: Array) -> list[Array]:
+        """Return copies of observations (n, …) as arrays of numbers."""
+        return [part.copy() for part in _parts(obs)]
+
+    def renew(self) -> None:
+        """Close the environments, and make a new one in their place: no more may exist at once."""
+        for env in self.envs:
+            env.close()
+        self.envs = []
+        self.envs = [self._made(self._make, 0)]
 
     def _notice_draws(self) -> None:
         """Give a notice if the environments have just drawn from global generators."""
         if drawn := self._draws.end():
-            self._draws.looks = 0
+            self._draws.looks, self.draws_globally = 0, True
+            modules = " and ".join(drawn)
+            if are_shared():
+                notice(
+                    f"several threads train or play, and their environments draw from {modules}, "
+                    "whose generator they share, so the same seed does not give the same weights. "
+                    f"Draw from {OWN_GENERATOR}; or train in processes in place of threads"
+                )
+                return
             notice(
-                f"{self._name} draws from {' and '.join(drawn)}, whose generator the whole program "
-                "shares. The run seeds it, so the same seed gives the same weights; but an episode "
-                "that is open when a run is resumed cannot be repeated. Draw from self.np_random "
-                "instead, which super().reset(seed=seed) seeds"
+                f"{self.name} draws from {modules}, whose generator the whole program shares. The "
+                "run seeds it, so the same seed gives the same weights, unless another thread "
+                "draws from it, too; but an episode that is open when a run is resumed cannot be "
+                f"repeated. Draw from {OWN_GENERATOR}"
             )
 
     def _made(self, make: Any, number: int) -> gym.Env[Any, Any]:

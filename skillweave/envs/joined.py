@@ -57,6 +57,11 @@ class JoinedEngines:
             info_rows(step.info, order, len(order)),
         )
 
+    def finish(self) -> None:
+        """Check the environments of all parts."""
+        for part in self.parts:
+            part.finish()
+
     def mask(self) -> Array | None:
         """Return the actions allowed in the latest observations, (N, A) bool; None: always all."""
         masks = [part.mask() for part in self.parts]

@@ -95,8 +95,9 @@ class EnvSpec:
             are split among them; None: one process.
         obs_names: names of an observation's numbers in reports: a name for each, or for a Dict such
             lists by key. None: those of the environment's attribute ``obs_names``.
-        check_seed: before training, reset one environment twice to one seed, with a step each, and
-            give a notice if the outcomes differ. Not in a pool.
+        check_seed: before training, play a few steps twice from one seed, and once with a second
+            environment in between; after training, also in a new environment. Give a notice if the
+            outcomes differ. Not in a pool.
 
     Raises:
         DeclarationError: a field has a wrong type, or fields do not fit each other; the message

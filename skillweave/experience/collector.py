@@ -265,6 +265,10 @@ class Collector:
         self._clear(ids)
         return self._begin_anew(ids)
 
+    def finish(self, _: None = None) -> None:
+        """Check at the end of training what it has left in the environments."""
+        self.engine.finish()
+
     def close(self) -> None:
         """Release the environments."""
         self.engine.close()

@@ -63,6 +63,11 @@ class Collectors:
         """
         return np.empty(0, np.int64)
 
+    def finish(self) -> None:
+        """Check at the end of training what it has left in the environments."""
+        for part in self.parts:
+            part.finish()
+
     def close(self) -> None:
         """Release the environments."""
         for part in self.parts:

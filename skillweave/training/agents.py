@@ -312,6 +312,7 @@ class Agents:
             if self.entry.kind == "skill" and self._is_unchanged():
                 log.report_learnt_nothing()
         log.report_episodes(self.loop.episodes.tally, over=True)
+        self.collectors.finish()
         if (best := self.best.found) is not None:
             for path, stack in self.stacks().items():
                 stack.state = state_to(self.best.states[path], stack.state.params.device)

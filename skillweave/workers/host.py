@@ -301,6 +301,10 @@ class WorkerCollectors(Workers, Collectors):
         """Restore the open episodes of ``state``; return (k,) environments that start again."""
         return self._columns(self.stand(split_states(state, len(self._workers))))
 
+    def finish(self) -> None:
+        """Check at the end of training what it has left in the environments."""
+        self.ask("finish", [None] * len(self._workers), kept=False)
+
     def _did_again(self, what: str, found: dict[int, Any]) -> None:
         for i, answer in found.items():
             if what == "restore":
