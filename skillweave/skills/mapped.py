@@ -263,12 +263,10 @@ def look_at_outputs(policy: MappedPolicy) -> None:
         rows = other_rows(first, len(obs), sizes, len(obs), 0)
         other = twin.outputs(obs[rows])
         differs = largest_difference(first, other, rows, 1e-2)
-        if (
-            differs
-            and written
-            and not largest_difference(first, policy.twin().outputs(obs[rows]), rows)
-        ):
-            raise PolicyError(hidden)
+        if written:
+            fresh = largest_difference(first, policy.twin().outputs(obs[rows]), rows, 1e-2)
+            if (fresh is None) != (differs is None):
+                raise PolicyError(hidden)
         if differs:
             raise PolicyError(
                 f"{who} answers {shown(differs[0])} for an observation, but {shown(differs[1])} for "

@@ -301,7 +301,8 @@ def other_rows(answer: Mapping[str, Array], n: int, taken: set[int], most: int, 
     """Return rows in another order and number, among which statistics are likely to be others.
 
     They are rows with the same answer, if many have it: where "above the mean" is true, it is false
-    for the least of these rows alone. Else they are those of the largest or smallest answers.
+    for the least of these rows alone. Else they are rows below the largest answers, or above the
+    smallest, without both ends, so that the mean and the extremes are others.
 
     Args:
         taken: numbers of rows that would not show a wrong axis.
@@ -319,7 +320,7 @@ def other_rows(answer: Mapping[str, Array], n: int, taken: set[int], most: int, 
         lengths = np.diff([*starts, n])
         longest = int(lengths.argmax())
         group = order[starts[longest] : starts[longest] + lengths[longest]]
-        group = group if 4 * len(group) >= n else order[n // 2 :]
+        group = group if 4 * len(group) >= n else order[n // 8 : max(5 * n // 8, 1)]
     else:  # all answers are equal
         group = order[look % n :][:1]
     group, size = group[::-1], min(len(group), most)
