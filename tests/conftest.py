@@ -115,10 +115,10 @@ def forget_registered() -> Iterator[None]:
 @pytest.fixture
 def unprobed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Call functions once, for the environments alone: for tests that record calls."""
-    monkeypatch.setattr("skillweave.skills.probing.first_time", lambda *_: False)
+    monkeypatch.setattr("skillweave.skills.outputs.look_at", lambda *_: None)
 
 
 @pytest.fixture
 def no_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     """Functions are called for what happens alone, not also to see whether they keep a state."""
-    monkeypatch.setattr("skillweave.skills.outputs.watch", lambda *_: None)
+    monkeypatch.setattr("skillweave.skills.outputs.look_at", lambda *_: None)

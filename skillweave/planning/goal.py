@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 
@@ -93,8 +94,13 @@ class GoalTask:
     def holds(self, obs: Array, goal: Array) -> Array:
         """Return where ``goal``, (G,) or (n, G), is reached in ``obs`` (n, …), (n,) bool."""
         who = f"goal: {function_name(self.reached)}()"
-        value = called(self.reached, read_only(obs), who, more=(goal,))
-        return checked(value, len(obs), bool, who)
+        one = goal.ndim == 1
+        more, fixed = ((), (goal,)) if one else ((goal,), ())
+        convert = partial(checked, n=len(obs), dtype=bool, who=who)
+        return cast(
+            Array,
+            called(self.reached, read_only(obs), who, more=more, fixed=fixed, convert=convert),
+        )
 
     def at(self, goal: Array | None) -> RewardMachine:
         """Return the task of one goal (G,), or None: of that which each observation holds."""

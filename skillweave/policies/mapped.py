@@ -291,6 +291,8 @@ class Outputs:
         size = prod(space.shape) if box else sum(space.counts)
         self.count = size if box else 0
         """The number of outputs that are numbers of an action."""
+        self.choices = [] if box or space.kind == "MultiBinary" else space.counts
+        """The numbers of logits of each choice; []: there are none, or one for each bit."""
         self._rest: Array | None = None
         self._to: Any = None
         if self.to is None:
@@ -301,7 +303,7 @@ class Outputs:
         self.count = len(self.to)
         self._to = np.array(self.to)
         if not box:
-            self._chosen = discrete(self.count)
+            self._chosen, self.choices = discrete(self.count), [self.count]
             return
         _check_sizes(self, (self.count,), "scale", "offset")
         if self.clip is not None and not self.clip[0] <= self.clip[1]:
@@ -315,6 +317,12 @@ class Outputs:
             )
         if self.to != tuple(range(size)):
             self._rest = np.zeros((1, size)) if self.rest is None else np.array([self.rest])
+
+    def allowed(self, mask: Array | None) -> Array | None:
+        """Return which choices of the model a mask (n, A) allows; None: it is not for them."""
+        if mask is None or mask.shape[1] != sum(self.space.counts):
+            return None
+        return mask if self._to is None else mask[:, self._to]
 
     def __call__(
         self, output: Any, n: int, mask: Array | None, turn: Turn
@@ -333,9 +341,7 @@ class Outputs:
             return self._decoded(output, n, space, mask, turn), output
         if space.kind == "Box":
             return self._scaled(np.asarray(output), n)
-        every = mask is not None and mask.shape[1] == sum(space.counts)
-        allowed = mask[:, self._to] if mask is not None and every else None
-        choice = self._decoded(output, n, self._chosen, allowed, turn)
+        choice = self._decoded(output, n, self._chosen, self.allowed(mask), turn)
         return (self._to[choice] + space.bounds[0]).astype(space.dtype), None
 
     def _decoded(self, output: Any, n: int, space: Space, mask: Array | None, turn: Turn) -> Array:
@@ -702,6 +708,10 @@ class Mapped(Policy):
     """Of the goals of calls; None: such a goal is numbers (n, G)."""
     who: str = field(default="the policy", metadata=HERE)
     """Begins messages."""
+    warn: Callable[[str], None] | None = field(default=None, repr=False, metadata=HERE)
+    """Gives users a notice; None: they get none."""
+    on_sample: str = field(default="", repr=False, metadata=HERE)
+    """The notice that is given when it samples."""
 
     def __post_init__(self) -> None:
         for name in ("every", "chunk"):
@@ -824,6 +834,38 @@ class Mapped(Policy):
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return actions (k, …), of this inference or of an earlier one."""
+        action = self._acted(memory, rows, obs, turn)
+        if self.warn is not None:
+            if self.on_sample and not turn.greedy:
+                self.warn(self.on_sample)
+                self.on_sample = ""
+            if turn.mask is not None and (text := self._forbidden(action, turn.mask)):
+                self.warn(text)
+                self.warn = None
+        return action
+
+    def _forbidden(self, action: Array, mask: Array) -> str:
+        """Return a notice about actions (k, …) that a mask (k, A) forbids; empty: there is none."""
+        space = self.outputs.space
+        if not space.counts or mask.shape[1] != sum(space.counts):
+            return ""
+        first = np.cumsum((0, *space.counts[:-1]))
+        chosen = np.take_along_axis(mask, first + space.choices_in(action), axis=1)
+        free = np.logical_or.reduceat(mask, first, axis=1)  # else no option is allowed
+        forbidden = np.flatnonzero((~chosen & free).any(axis=1))
+        if not len(forbidden):
+            return ""
+        row = forbidden[0]
+        return (
+            f"{self.who} chose the action {action[row].tolist()}, which the environment's action "
+            f"mask forbids, in {len(forbidden)} of {len(action)} environments of one step: a policy "
+            "that chooses by itself must know what is allowed. Let it see the mask in the "
+            "observation, return logits, which are masked, or start only where its action is "
+            "allowed (initiation)"
+        )
+
+    def _acted(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return actions (k, …) of the model."""
         if self._simple:
             output, _ = self.model.call({"": obs}, (), turn)
             return self.outputs(output, len(rows), turn.mask, turn)[0]
@@ -841,16 +883,22 @@ class Mapped(Policy):
         found: Array = held[rows, phase // self.every]
         return found
 
-    def _inferred(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> list[Array]:
-        """Return the next actions, (k, …) each."""
-        n, outputs, chunk = len(rows), self.outputs, self.chunk
+    def infer(
+        self, memory: Memory, rows: Array, obs: Array, turn: Turn
+    ) -> tuple[Any, Sequence[Array]]:
+        """Return the outputs (k, …) of the model, and its next state."""
         inputs = {"": obs}
         if self.inputs is not None:
             goal = None if self._goal_shape is None else self._aim(obs, turn)
             last = memory["last"][rows] if self._last else None
             inputs = {name: one(obs, goal, last) for name, one in self.inputs.items()}
         before = tuple(memory[key][rows] for key, _, _ in self._states)
-        output, after = self.model.call(inputs, before, turn)
+        return self.model.call(inputs, before, turn)
+
+    def _inferred(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> list[Array]:
+        """Return the next actions, (k, …) each."""
+        n, outputs, chunk = len(rows), self.outputs, self.chunk
+        output, after = self.infer(memory, rows, obs, turn)
         if chunk is None:
             several = [output]
         else:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, cast
 
 import numpy as np
 from gymnasium import Space
@@ -32,7 +32,6 @@ from skillweave.skills.goal_spaces import alone, draw_from
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.outputs import Wrapped, answer, as_array, called
 from skillweave.skills.own_part import declared_acts, declared_sees
-from skillweave.skills.probing import probe
 from skillweave.skills.residual import Residual
 from skillweave.skills.spelling import misspelt
 from skillweave.types import Array, Step
@@ -359,9 +358,8 @@ class Reflex:
     def _act(self, space: Data, obs: Array) -> Array:
         """Return the actions (n, ...) of its function."""
         label = f"{self._label}: action()"
-        actions = space.actions(called(self.action, obs, label), len(obs), label, SkillError)
-        probe(self.action, obs, label, space)
-        return actions
+        convert = partial(space.actions, n=len(obs), who=label, kind=SkillError)
+        return cast(Array, called(self.action, obs, label, convert=convert))
 
     def _fixed(self, space: Data) -> Array:
         """Return a fixed action, (1, ...)."""

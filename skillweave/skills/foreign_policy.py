@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -18,9 +17,11 @@ from skillweave.errors import PolicyError, RunError, SkillweaveError
 from skillweave.policies.files import checksum
 from skillweave.policies.spaces import at, space_of
 from skillweave.skills.goal_spaces import draw_from
-from skillweave.skills.probing import untouched, watch
+from skillweave.skills.probing import Call, examples, look_at
 from skillweave.types import Array, Memoryless, Policy
 
+EXAMPLES = 16
+"""The number of example observations on which a policy is tried out."""
 SEES = "let sees= give the parts that it takes"
 ACTS = "let acts= say what its outputs mean"
 """What to do about a policy with other spaces, for messages."""
@@ -79,7 +80,7 @@ class Foreign(Memoryless):
             PolicyError: it failed; the message names the policy and the space.
         """
         try:
-            with untouched(getattr(self, "function", None)):
+            with examples(getattr(self, "function", None)):
                 self.act(self.start(2), made_up(self.observation_space, 2))
         except SkillweaveError:
             raise
@@ -144,9 +145,24 @@ def check_spaces(
             "gymnasium.wrappers.RescaleAction. If they are right, write acts=Acts()"
         )
     if is_own_code(type(policy)):
-        act = partial(policy.act, policy.start(2))
-        for _ in range(2):  # the second call gives the notice
-            watch(act, made_up(observation_space, 2), (), whose, False)
+        _look_at_own(policy, observation_space, whose)
+
+
+def _look_at_own(policy: Policy, observation_space: Space[Any], whose: str) -> None:
+    """Look at the actions of a policy of the user's class for examples."""
+
+    def act(obs: Array) -> Any:
+        return policy.act(policy.start(len(obs)), obs)[0]
+
+    obs = made_up(observation_space, EXAMPLES)
+    with examples(policy):
+        look = look_at(Call(act, (obs,), owner=policy), False)
+        try:
+            action = act(obs)
+        except (Exception, SystemExit):
+            return  # it is raised where the policy acts
+        if look is not None:
+            look.check(action, whose, PolicyError)
 
 
 @dataclass

@@ -84,7 +84,7 @@ class Goals(CallGoals):
         """
         goal, rows = self.start(len(obs)), np.arange(len(obs))
         for _ in range(TRIES):
-            given = called(self.skill.goals, read_only(obs), self._label, more=(rng,))
+            given = called(self.skill.goals, read_only(obs), self._label, fixed=(rng,))
             goal[rows] = self.fitted(obs, given, self._label)
             again = self.hold(obs, goal[rows], self.skill.termination)
             if not again.any():

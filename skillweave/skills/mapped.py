@@ -17,16 +17,26 @@ from gymnasium.spaces import Box, Dict, Tuple
 from skillweave._internal.messages import short
 from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.policies.core import Policy as InPlace
+from skillweave.policies.core import Policy as InPlace, Turn, World
 from skillweave.policies.functional import Functional
-from skillweave.policies.mapped import Input, Mapped, Model, numbers_of
+from skillweave.policies.mapped import Function, Input, Mapped, Model, numbers_of
+from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.policies.spaces import Space as Data
-from skillweave.skills.foreign_policy import SEES, Foreign, made_up
+from skillweave.skills.foreign_policy import EXAMPLES, SEES, Foreign, made_up
 from skillweave.skills.goal_spaces import with_goal, without_goal
 from skillweave.skills.goals import Goals
 from skillweave.skills.mapping import LastAction, PolicyMapping
 from skillweave.skills.outputs import Wrapped, of_numbers
 from skillweave.skills.plan import described, fitted_inputs, fitted_outputs, for_model
+from skillweave.skills.probing import (
+    MOST_BYTES,
+    State,
+    examples,
+    largest_difference,
+    other_rows,
+    parts_of,
+    shown,
+)
 from skillweave.types import Array, Memoryless
 
 
@@ -88,14 +98,47 @@ class MappedPolicy(Functional, Foreign, Model):
             if goal_space is not None:
                 own["goal"] = (goal_space.size,)
             elif isinstance(goal, Wrapped):
-                own["goal"] = numbers_of(goal, made_up(seen, 2), f"{who}: goal()").shape[1:]
+                with examples(goal.bare):
+                    goals = numbers_of(goal, made_up(seen, 2), f"{who}: goal()")
+                own["goal"] = goals.shape[1:]
                 if len(own["goal"]) != 1:
                     raise PolicyError(f"{who}: goal() must return (n, numbers)")
             elif goal is not None:
                 own["goal"] = goal.shape
             inputs = for_model(fitted_inputs(mapping, seen, who, own), model.expected, who)
         every, chunk = mapping.every, mapping.chunk
-        return Mapped(model, outputs, inputs, every, chunk, goal, goal_space, who)
+        return Mapped(model, outputs, inputs, every, chunk, goal, goal_space, who, notice)
+
+    def try_out(self) -> None:
+        """Act once on two example observations, and look at a model's outputs.
+
+        Raises:
+            PolicyError: it failed, or its outputs for an observation depend on something else.
+        """
+        super().try_out()
+        if not isinstance(self.model, Function):
+            look_at_outputs(self)
+
+    def twin(self) -> Self:
+        """Return a copy whose calls leave no traces in this policy."""
+        return copy.copy(self)
+
+    def outputs(self, obs: Array) -> dict[str, Array]:
+        """Return the model's outputs for observations, with a fresh memory.
+
+        Raises:
+            PolicyError: it failed.
+        """
+        acting, goal, n = self.in_place, None, len(obs)
+        assert isinstance(acting, Mapped)
+        if self.joins:
+            obs, goal = obs[OBSERVATION], obs[GOAL]
+        turn = Turn(World(np.random.default_rng(0)), None, goal)
+        return parts_of(acting.infer(acting.start(n), np.arange(n), obs, turn)[0])
+
+    def tensors(self) -> dict[str, Any]:
+        """Return copies of the tensors that its module may write, by name."""
+        return {}
 
     def must_be_bound(self) -> None:
         """Raise a PolicyError if it has not the spaces that it needs yet."""
@@ -181,6 +224,93 @@ class MappedPolicy(Functional, Foreign, Model):
         if "in_place" in vars(self):
             _ = policy.in_place
         return policy
+
+
+def look_at_outputs(policy: MappedPolicy) -> None:
+    """Compare the outputs of a model for examples with those for the same beside others.
+
+    A notice says that they are random, or not logits but probabilities.
+
+    Raises:
+        PolicyError: they depend on a hidden state, or on the other observations.
+    """
+    who, space = policy._who, policy.observation_space
+    size = max(made_up(space, 1).nbytes, 1)
+    obs = made_up(space, int(np.clip(MOST_BYTES // size, 4, EXAMPLES)))
+    every, twin = np.arange(len(obs)), policy.twin()
+    before = twin.tensors()
+    with examples(None), np.errstate(all="ignore"):
+        state = State(None)
+        first = twin.outputs(obs)
+        if not first or any(x.shape[:1] != every.shape for x in first.values()):
+            return  # it is an error where it acts
+        now = twin.tensors()
+        written = [k for k, x in now.items() if k not in before or not np.array_equal(x, before[k])]
+        hidden = f"{who} {hidden_state(written)}"
+        if largest_difference(first, twin.outputs(obs), every):
+            state.prepare()
+            if written or (policy.kind == "torch" and not state_of_chance(policy, first, obs)):
+                raise PolicyError(hidden)
+            if all(x.dtype.kind == "f" for x in first.values()):
+                notice(
+                    f"{who} answers otherwise when it is asked about the same observations again, "
+                    "as it draws random numbers (dropout that is always on, for example): its "
+                    "actions are random, also with deterministic=True. Let it return what is most "
+                    "likely, or logits, without random numbers"
+                )
+            return
+        sizes = {len(obs), *(n for x in (obs, *first.values()) for n in x.shape[1:])}
+        rows = other_rows(first, len(obs), sizes, len(obs), 0)
+        other = twin.outputs(obs[rows])
+        differs = largest_difference(first, other, rows, 1e-2)
+        if written:
+            fresh = largest_difference(first, policy.twin().outputs(obs[rows]), rows, 1e-2)
+            if (fresh is None) != (differs is None):
+                raise PolicyError(hidden)
+        if differs:
+            raise PolicyError(
+                f"{who} answers {shown(differs[0])} for an observation, but {shown(differs[1])} for "
+                "the same one beside other observations, so an environment's action depends on the "
+                "other environments: let the model use no statistics over the batch (mean(0), "
+                "batch normalization in training mode)"
+            )
+    _note_probabilities(policy, first)
+
+
+def hidden_state(written: Sequence[str]) -> str:
+    """Return a clause about the tensors that a module writes, and by which it answers."""
+    return (
+        f"keeps a hidden state, {', '.join(map(repr, written[:3])) or 'a tensor'}, which would run "
+        "on from one episode into the next, and which all environments would share: let "
+        "forward(obs, state) return the output and the next state, and give the shape of the "
+        "state, from_torch(module, state=(None, 64))"
+    )
+
+
+def state_of_chance(policy: MappedPolicy, first: dict[str, Array], obs: Array) -> bool:
+    """Return whether the outputs come again with the same random numbers."""
+    again = policy.twin().outputs(obs)
+    return largest_difference(first, again, np.arange(len(obs))) is None
+
+
+def _note_probabilities(policy: MappedPolicy, outputs: dict[str, Array]) -> None:
+    """Let a policy give a notice where its outputs for examples are probabilities, not logits."""
+    acting = policy.in_place
+    assert isinstance(acting, Mapped)
+    meaning, output = acting.outputs, outputs.get("")
+    if not meaning.logits or output is None or output.dtype.kind != "f":
+        return
+    width = sum(meaning.choices)
+    if not width or output.shape[-1] != width or (output < 0).any():
+        return
+    ends = np.cumsum(meaning.choices)[:-1]
+    sums = [part.sum(-1) for part in np.split(output, ends, axis=-1)]
+    if np.allclose(sums, 1.0, atol=1e-3):
+        acting.on_sample = (
+            f"{policy._who} returns numbers that are at least 0 and sum to 1, so probabilities, but "
+            "is sampled as if they were logits: leave out the network's last Softmax, or use "
+            "LogSoftmax"
+        )
 
 
 def check_range(goals: Goals, places: Sequence[Any], who: str) -> None:

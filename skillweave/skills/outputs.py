@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from skillweave._internal.messages import error_text, short, suggest
 from skillweave._internal.tracebacks import is_users
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
 from skillweave.policies.infos import NUMBERS, Infos
-from skillweave.skills.probing import probe, watch
+from skillweave.skills.probing import Call, look_at
 from skillweave.types import LARGEST_REWARD, Array, Step, read_only, wrong_reward
 
 OF_DICTS = ("no field of name", "dtype([", "VoidDType", "numpy.void")
@@ -28,25 +28,35 @@ def called(
     ids: Array | None = None,
     kind: type[SkillweaveError] = SkillError,
     more: tuple[Any, ...] = (),
+    named: Mapping[str, Any] | None = None,
+    fixed: tuple[Any, ...] = (),
     judges: bool | None = False,
+    looks: bool = True,
+    convert: Callable[[Any], Any] = lambda value: value,
 ) -> Any:
     """Return the result of a function of the user; all of them are called here.
 
     Args:
-        function: takes one argument, and ``more``.
-        argument: a step, or observations; a dict: arguments by name.
+        function: takes one argument, ``more``, ``fixed`` and ``named``.
+        argument: a step, or observations; None: all are named.
         who: the function's name in messages.
         ids: the environments of the rows.
         kind: the type of the error: PolicyError if the function is a policy.
-        more: further arguments.
+        more: further arguments, with a row for each environment.
+        named: arguments by name, with a row for each environment.
+        fixed: further arguments, the same for all environments.
         judges: its answer to the same must never change; None: it may keep a state.
+        looks: it may be called again with other rows.
+        convert: checks and converts the result.
 
     Raises:
         SkillError: the function raised; the message names ``who``, the line, and the step if known.
+            Or its answer about an environment depends on something else, see ``probing``.
     """
-    watch(function, argument, more, who, judges)
+    call = Call(function, () if argument is None else (argument, *more), named or {}, fixed)
+    look = look_at(call, judges) if looks else None
     try:
-        return function(**argument) if isinstance(argument, dict) else function(argument, *more)
+        value = call()
     except SkillweaveError:
         raise
     except (Exception, SystemExit) as error:
@@ -54,6 +64,10 @@ def called(
         given = "" if about is None else f" for observations of shape {about}"
         advice = _advice(error, function, argument, ids)
         raise kind(f"{who} raised {error_text(error)}{when}{given}{advice}") from error
+    converted = convert(value)
+    if look is not None:
+        look.check(value, who, kind)
+    return converted
 
 
 @dataclass(frozen=True)
@@ -77,7 +91,8 @@ def of_numbers(function: Any, who: str) -> Wrapped:
 
 
 def _numbers(function: Any, who: str, obs: Array) -> Array:
-    return as_array(called(function, obs, who, kind=PolicyError), who, PolicyError)
+    convert = partial(as_array, who=who, kind=PolicyError)
+    return cast(Array, called(function, obs, who, kind=PolicyError, convert=convert))
 
 
 def answer(
@@ -102,13 +117,15 @@ def answer(
         n, elapsed = len(about.reward), about.elapsed
     else:
         n, about = len(about), read_only(about)
-    value = called(function, about, who, ids, judges=None if may_change else True)
-    objects = isinstance(value, np.ndarray) and value.dtype == object
-    if objects and isinstance(about, Step) and (odd := odd_key(function, about.info, ids)):
-        raise SkillError(f"{who}{at_step(elapsed)}: {odd}")
-    array = checked(value, n, dtype, who, elapsed, ids)
-    probe(function, about, who)
-    return array
+
+    def convert(value: Any) -> Array:
+        objects = isinstance(value, np.ndarray) and value.dtype == object
+        if objects and isinstance(about, Step) and (odd := odd_key(function, about.info, ids)):
+            raise SkillError(f"{who}{at_step(elapsed)}: {odd}")
+        return checked(value, n, dtype, who, elapsed, ids)
+
+    judges = None if may_change else True
+    return cast(Array, called(function, about, who, ids, judges=judges, convert=convert))
 
 
 def ask(function: Callable[[Any], Any], about: Any, rows: Array, path: str, name: str) -> Array:

@@ -25,6 +25,7 @@ from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import made_up
 from skillweave.skills.mapping import Acts, Goal, LastAction, Part, PolicyMapping, Source
 from skillweave.skills.outputs import of_numbers
+from skillweave.skills.probing import examples
 from skillweave.types import Array
 
 # Inputs
@@ -109,7 +110,8 @@ class _Reader:
             return [Take("last_action", self.own["last_action"])]
         who = f"{where}, a function,"
         function = of_numbers(source.function, who)
-        shape = numbers_of(function, made_up(self.space, 2), who).shape[1:]
+        with examples(source.function):
+            shape = numbers_of(function, made_up(self.space, 2), who).shape[1:]
         if len(shape) > 1 and not alone:
             raise PolicyError(
                 f"{where}: a function beside other parts must return (n, numbers), not shape "

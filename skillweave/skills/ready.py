@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from types import MethodType
 from typing import Any
 
@@ -33,32 +34,54 @@ def ready_policy(skill: Skill) -> Policy | None:
 
 
 def _as_policy(value: Any, skill: Skill) -> Policy:
-    where = f"skill {skill.name!r}: policy is"
-    refuse_skill(value, where.removesuffix(" is"))
+    # A function in a class body becomes a method when it is looked up. It is a method if it needs
+    # two arguments (``def policy(self, obs)``), and a function of obs if it needs one.
+    bound = isinstance(value, MethodType) and value.__self__ is skill
+    if bound and not _is_method(value.__func__, skill):
+        value = value.__func__
+    return as_policy(value, f"skill {skill.name!r}: policy")
+
+
+def as_policy(value: Any, where: str) -> Policy:
+    """Return a policy as it is, a torch module or a function of observations as a policy.
+
+    Raises:
+        DeclarationError: it cannot act; ``where`` begins the message.
+    """
+    refuse_skill(value, where)
     if isinstance(value, type):
-        raise DeclarationError(f"{where} the class {value.__name__}, not a policy")
+        raise DeclarationError(f"{where} is the class {value.__name__}, not a policy")
     if hasattr(value, "act") and hasattr(value, "start"):
         policy: Policy = value
         return policy
     torch = sys.modules.get("torch")  # imported if the user has a module
     if torch is not None and isinstance(value, torch.nn.Module):
         return from_torch(value)
-    # A function in a class body becomes a method when it is looked up. It is a method if it needs
-    # two arguments (``def policy(self, obs)``), and a function of obs if it needs one.
-    bound = isinstance(value, MethodType) and value.__self__ is skill
-    if bound and not _is_method(value.__func__, skill):
-        value = value.__func__
     if callable(value):
         return from_function(value)
-    own = getattr(value, "policy", None)  # of a run, or of a skill that is ready
-    if hasattr(own, "act") and hasattr(own, "start"):
+    own = getattr(value, "policy", None)
+    if hasattr(own, "act") and hasattr(own, "start"):  # of a run, or of a skill that is ready
         raise DeclarationError(
-            f"{where} {short(value)}, which has a policy, but is none: write its .policy"
+            f"{where} is {short(value)}, which has a policy, but is none: write its .policy"
         )
-    raise DeclarationError(
-        f"{where} {short(value)}, which cannot act; give a function of observations, a torch "
-        "module, from_sb3(...), from_onnx(...), or a policy"
+    advice = (
+        "give a function of observations, a torch module, from_sb3(...), from_onnx(...), or a "
+        "policy"
     )
+    if hasattr(value, "predict") and hasattr(value, "observation_space"):
+        advice = "a model of Stable-Baselines3 acts by from_sb3(model)"
+    elif isinstance(value, str | Path) and (make := FILES.get(Path(value).suffix)):
+        advice = f"a file acts by {make.format(str(value))}"
+    raise DeclarationError(f"{where} is {short(value)}, which cannot act; {advice}")
+
+
+FILES = {
+    ".onnx": "from_onnx({!r})",
+    ".zip": "from_sb3({!r}, algorithm, trust=True)",
+    ".pt": "from_torch({!r}, trust=True)",
+    ".pt2": "from_torch({!r}, trust=True)",
+}
+"""How files act, by their suffix."""
 
 
 PART = ", of which the skill has a part (sees, acts),"

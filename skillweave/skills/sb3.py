@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from inspect import signature
 from pathlib import Path
 from typing import Any, Literal, Self, overload
 
@@ -17,7 +18,7 @@ from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, needs_extra
 from skillweave.policies.core import Turn
 from skillweave.policies.files import check_file, checksum, read_file
-from skillweave.policies.mapped import Shapes
+from skillweave.policies.mapped import Mapped, Shapes
 from skillweave.schema import fitted
 from skillweave.skills.foreign_policy import made_up
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of, no_mapping
@@ -32,7 +33,8 @@ ALGORITHMS = {"PPO": "PPO", "A2C": "PPO", "DQN": "DQN", "SAC": "SAC", "TD3": "TD
 class SB3Policy(TorchPolicy):
     """The policy of a Stable-Baselines3 model; without a mapping it acts on the model's own spaces.
 
-    Samples are from the policy's distribution; DQN's exploration belongs to its training.
+    Samples are from the policy's distribution; DQN's exploration belongs to its training. A model
+    whose ``predict`` takes ``action_masks`` gets the environment's mask.
     """
 
     kind = "sb3"
@@ -102,15 +104,21 @@ class SB3Policy(TorchPolicy):
         parts: Any = inputs.get("", inputs)
         if self.mapping.sees is None:
             parts = unpack(self.observation_space, parts)
+        how = {}
+        acting, mask = self.in_place, None
+        if turn.mask is not None and isinstance(acting, Mapped):
+            mask = acting.outputs.allowed(turn.mask)
+        if mask is not None and "action_masks" in signature(self.module.predict).parameters:
+            how = {"action_masks": mask}
         try:
             if turn.greedy:
-                return self.module.predict(parts, deterministic=True)[0], ()
+                return self.module.predict(parts, deterministic=True, **how)[0], ()
             # It samples from torch's global generator, which other code may use.
             rng = turn.world.rng or np.random.default_rng()
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(int(rng.integers(2**62)))
                 _reset_noise(self.module, len(next(iter(inputs.values()))))
-                return self.module.predict(parts, deterministic=False)[0], ()
+                return self.module.predict(parts, deterministic=False, **how)[0], ()
         except (Exception, SystemExit) as error:
             raise self._failure(error) from error
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Literal
 
 from gymnasium.spaces import Dict, Tuple
@@ -14,12 +14,10 @@ from skillweave.errors import DeclarationError, PolicyError
 from skillweave.policies.core import Memory, Policy as InPlace, Turn
 from skillweave.policies.mapped import Function
 from skillweave.policies.parts import GOAL
-from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
 from skillweave.skills.outputs import Wrapped, as_array, called, parameters_of, required_arguments
-from skillweave.skills.probing import probe
 from skillweave.types import Array, read_only
 
 
@@ -76,10 +74,13 @@ class ScriptedPolicy(MappedPolicy):
     def _ask(self, *given: Any, **named: Any) -> Any:
         """Return what the function makes of its inputs, and perhaps of a goal or a state."""
         who, mapping, space = self._who, self.mapping, self.action_space
+        first, more = (given[0], given[1:]) if given else (None, ())
+        looks = all(shape[0] is None for shape in mapping.state)
+        value = called(
+            self.function, first, who, kind=PolicyError, more=more, named=named, looks=looks
+        )
         if not given:
-            return called(self.function, named, who, kind=PolicyError)
-        function = partial(self.function, **named) if named else self.function
-        value = called(function, given[0], who, kind=PolicyError, more=given[1:])
+            return value
         if mapping.state and isinstance(value, tuple | list) and len(value) == 2:
             output, after = value
             several = not mapping.single_state and isinstance(after, tuple | list)
@@ -91,12 +92,7 @@ class ScriptedPolicy(MappedPolicy):
             return value
         if isinstance(value, Mapping):
             self.must_be_bound()
-        action, n = as_array(value, who, PolicyError), len(given[0])
-        plain = mapping.acts is None and mapping.chunk is None
-        alone = len(given) == 1 and not named
-        if space is not None and plain and alone and action.shape == (n, *(space.shape or ())):
-            probe(function, given[0], who, space_of(space), PolicyError)
-        return action
+        return as_array(value, who, PolicyError)
 
 
 class _Alone(InPlace):

@@ -33,7 +33,7 @@ from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import Foreign, made_up, qualified
 from skillweave.skills.goal_spaces import alone
 from skillweave.skills.outputs import Wrapped, answer, called, required_arguments
-from skillweave.skills.probing import probe
+from skillweave.skills.probing import examples
 from skillweave.skills.tree import Composite, Condition, Node, Sequence
 from skillweave.types import Array
 
@@ -179,10 +179,11 @@ class FunctionSelector(ReadySelector):
         return Asked(*self._rule_of, Wrapped(self.function, self._ask), asks_last)
 
     def _ask(self, obs: Array, *last: LastCall) -> Any:
-        value = called(self.function, obs, self._who, more=last)
-        if self.in_place.parted(value, len(obs))[1] is None:
-            probe(self.function, (obs, *last), self._who)
-        return value
+        def convert(value: Any) -> Any:
+            self.in_place.parted(value, len(obs))
+            return value
+
+        return called(self.function, obs, self._who, more=last, convert=convert)
 
     def source(self) -> dict[str, Any]:
         """Return the function's name."""
@@ -234,10 +235,11 @@ class TreeSelector(ReadySelector):
         return Leaf(name, None if goal is None else self._goal(name, goal, self._who))
 
     def try_out(self) -> None:
-        """Evaluate every condition once on two example observations."""
+        """Evaluate every condition once on two examples of observations."""
         obs = made_up(self.observation_space, 2)
         for condition in self.in_place.checks:
-            condition.function(obs)
+            with examples(condition.function.bare):
+                condition.function(obs)
 
     def source(self) -> dict[str, Any]:
         """Return the checksum of its nodes, with only the names of functions."""

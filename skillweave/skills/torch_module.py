@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import copy
 import io
+import warnings
 import zipfile
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
+import numpy as np
 from gymnasium import Space
 
 from skillweave._internal.arguments import checked_names
@@ -18,9 +21,9 @@ from skillweave.policies.core import Turn
 from skillweave.policies.files import checksum, read_file
 from skillweave.policies.mapped import invoke, of_model, parted, rows_first, states_of
 from skillweave.schema import fitted
-from skillweave.skills.foreign_policy import qualified
+from skillweave.skills.foreign_policy import made_up, qualified
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, layers_of, no_mapping
-from skillweave.skills.mapped import MappedPolicy
+from skillweave.skills.mapped import MappedPolicy, hidden_state
 from skillweave.skills.mapping import PolicyMapping, mapping_of
 from skillweave.types import Array
 
@@ -78,6 +81,37 @@ class TorchPolicy(MappedPolicy):
     def _own_module(self) -> nn.Module:
         module: nn.Module = copy.deepcopy(self.module).eval()
         return module
+
+    def twin(self) -> Self:
+        """Return a copy with a module of its own."""
+        twin = copy.copy(self)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of torch, about exported programs
+            twin.module = copy.deepcopy(self.module)
+        return twin
+
+    def tensors(self) -> dict[str, Any]:
+        """Return copies of the buffers of its module, and of tensors in attributes, by name."""
+        from torch import Tensor
+
+        found: dict[str, Any] = dict(self.module.named_buffers())
+        for path, part in self.module.named_modules():
+            for name, value in vars(part).items():
+                several = value if isinstance(value, tuple | list) else (value,)
+                inner = {f"{path}.{name}".lstrip("."): x for x in several if isinstance(x, Tensor)}
+                found |= inner
+        return {name: x.detach().cpu().numpy().copy() for name, x in found.items()}
+
+    def _failure(self, error: BaseException) -> PolicyError:
+        """Return the error of a call that failed, also where it writes a state of one environment."""
+        twin, before = self.twin(), self.tensors()
+        twin._failure = super()._failure  # type: ignore[method-assign]
+        with suppress(Exception):
+            twin.outputs(made_up(self.observation_space, 1))
+        after = twin.tensors()
+        if written := [k for k, x in after.items() if not np.array_equal(x, before.get(k))]:
+            return PolicyError(f"{self._who} {hidden_state(written)}")
+        return super()._failure(error)
 
     @property
     def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:

@@ -31,6 +31,7 @@ from skillweave.schema import UNSAVED, AtLeastOne, Count, fitted
 from skillweave.skills import Skill
 from skillweave.skills.foreign_policy import Foreign, check_spaces
 from skillweave.skills.goals import goals_of
+from skillweave.skills.ready import as_policy
 from skillweave.skills.skill_set import skills_below
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls
@@ -293,7 +294,7 @@ def interquartile_means(values: Array) -> Array:
 
 @checked_names
 def evaluate(
-    policy: Policy,
+    policy: Policy | Callable[..., Any],
     env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec,
     *,
     episodes: int = 100,
@@ -309,7 +310,8 @@ def evaluate(
     """Play ``episodes`` whole episodes and score them by the environment's own reward.
 
     Args:
-        policy: the acting policy; one of ``from_function`` gets the environment's spaces.
+        policy: the acting policy; also a torch module, or a function of observations. One without
+            spaces gets the environment's.
         env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
         seed: of the episodes; the same seed gives the same starts to every policy.
         deterministic: act greedily, else sample. Skills of a hierarchy that was chosen because
@@ -331,10 +333,11 @@ def evaluate(
 
     Raises:
         PolicyError: the policy was made for other spaces.
-        DeclarationError: the engine does not exist; or calls are to be logged, of a policy without
+        DeclarationError: the policy cannot act; the engine does not exist; or calls are to be logged, of a policy without
             skills, of a skill that acts alone, or more than 4 GiB of them.
         EnvError: the environment cannot be made, or not in a pool, or sets no such key of ``info``.
     """
+    policy = as_policy(policy, "evaluate(): policy")
     episodes = fitted(AtLeastOne, episodes, "episodes")
     seed = fitted(Count, seed, "seed")
     max_steps = fitted(AtLeastOne | None, max_steps, "max_steps")

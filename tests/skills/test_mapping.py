@@ -93,17 +93,18 @@ def test_a_goal_that_is_given_to_act_replaces_the_fixed_one():
 
 
 def test_goals_and_computed_numbers_keep_their_number():
-    widths = iter([2, 2, 2, 2, 3])
+    width = 2
 
     def grows(obs: Array) -> Array:
-        return np.zeros((len(obs), next(widths)))
+        return np.zeros((len(obs), width))
 
     policy = fit(sw.from_function(zeros, sees=("gyro", sw.Goal()), goal=(1, 2)))
     with pytest.raises(PolicyError, match=r"the goal has shape \(2, 3\), but \(2,\) was"):
         policy.act({}, observations(2, 1)[0], goal=np.zeros((2, 3)))
     for how in ({"sees": ("gyro", grows)}, {"sees": sw.Goal(), "goal": grows}):
-        widths = iter([2, 2, 3])
+        width = 2
         policy = fit(sw.from_function(zeros, **how))
+        width = 3
         with pytest.raises(PolicyError, match=r"returned numbers of shape \(3,\).*\(2,\) at first"):
             policy.act({}, observations(2, 1)[0])
     with pytest.raises(PolicyError, match="returned a NaN or an infinity"):
@@ -111,10 +112,11 @@ def test_goals_and_computed_numbers_keep_their_number():
 
 
 def test_what_is_remembered_is_no_array_of_the_users():
-    kept, out = np.zeros((2, 1)), np.zeros((2, 5))
+    arrays = {n: (np.zeros((n, 1)), np.zeros((n, 5))) for n in range(1, 9)}
 
     def counts(x: Array, state: Array):
-        kept[:] = state + 1  # the same arrays at each call
+        kept, out = arrays[len(x)]  # the same arrays at each call
+        kept[:] = state + 1
         out[:] = kept / 100 + x[:, 3:] / 10
         return out, kept
 

@@ -24,7 +24,7 @@ from skillweave.skills.foreign_policy import check_spaces
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.skills.goals import Goals
 from skillweave.skills.outputs import answer, called
-from skillweave.skills.probing import watch
+from skillweave.skills.probing import look_at
 from skillweave.types import Memoryless
 
 OBS = step().next_obs
@@ -69,13 +69,20 @@ class Own(Memoryless):
 
 def acts(**how):
     policy = from_function(Best(), **how).bind(*SPACES, "it")
-    policy.try_out()
-    return lambda: policy.act({}, OBS)
+
+    def tried() -> None:
+        policy.try_out()
+        policy.act({}, OBS)
+
+    return tried
 
 
 def reads(function):
-    policy = from_function(lambda x: np.zeros(len(x), int), sees=function).bind(*SPACES, "it")
-    return lambda: policy.act({}, OBS)
+    def bound() -> None:
+        policy = from_function(lambda x: np.zeros(len(x), int), sees=function)
+        policy.bind(*SPACES, "it").act({}, OBS)
+
+    return bound
 
 
 def chooses(value):
@@ -151,7 +158,7 @@ def test_every_module_that_calls_functions_of_the_user_is_tested():
         name.removeprefix("skillweave.")
         for name, module in sys.modules.items()
         if name.startswith("skillweave.") and not name.endswith(others)
-        for rule in (called, answer, watch)
+        for rule in (called, answer, look_at)
         if vars(module).get(rule.__name__) is rule
     }
     assert calls == set(places())
