@@ -71,6 +71,8 @@ class Handover:
         needed: (S + 1, S) int64, the steps of an episode in which half of the calls that began too
             late would have counted, 0: there were none; None: unknown.
         steps: the logged steps; 0: unknown.
+        cut_else: calls that count, and were cut by a truncation before the time limit: they count
+            as they ended.
     """
 
     skills: tuple[str, ...]
@@ -81,6 +83,7 @@ class Handover:
     time_limit: int = 0
     needed: Array | None = None
     steps: int = 0
+    cut_else: int = 0
 
     @property
     def before(self) -> tuple[str, ...]:
@@ -181,7 +184,9 @@ class Handover:
         more = "record more calls"
         if self.steps:
             steps = rounded_up(self.steps * LEAST / int(self.calls[few & worse].min()))
-            more = f"with about {steps:,} logged steps, in place of {self.steps:,}, it has {LEAST}"
+            more = (
+                f"with about {steps:,} logged steps, in place of {self.steps:,}, each has {LEAST}"
+            )
         return [f"Too few calls to say whether a handover is weak: {pairs}; {more}"]
 
     def _without_time(self) -> list[str]:
@@ -263,16 +268,22 @@ class Handover:
 
     @property
     def left_out(self) -> str:
-        """A sentence on the calls that began too late; empty: there were none."""
-        late = int(self.began_late.sum())
-        if not late:
-            return ""
-        few = self._lacks_time
-        more = f". Some pairs have few calls left; {self._more_time(few)}" if few.any() else ""
-        return (
-            f"Left out, as they began too late to run their whole length before the episode's time "
-            f"limit of {self.time_limit:,} steps: {late:,} call{'s' * (late != 1)}{more}."
-        )
+        """Sentences on calls that began too late, or were cut otherwise; empty: there were none."""
+        late, sentences = int(self.began_late.sum()), []
+        if late:
+            few = self._lacks_time
+            more = f". Some pairs have few calls left; {self._more_time(few)}" if few.any() else ""
+            sentences.append(
+                "Left out, as they began too late to run their whole length before the episode's "
+                f"time limit of {self.time_limit:,} steps: {late:,} call{'s' * (late != 1)}{more}."
+            )
+        if self.cut_else:
+            before = f" before step {self.time_limit:,}" if self.time_limit else ""
+            sentences.append(
+                f"In {self.cut_else:,} call{'s' * (self.cut_else != 1)} the environment truncated "
+                f"the episode{before}, which counts as the end of the call."
+            )
+        return " ".join(sentences)
 
     def to_json(self) -> dict[str, Any]:
         """Return the counts, and the sentences of ``weakest``, as plain JSON."""
@@ -729,8 +740,19 @@ class LinkedCalls(CallColumns):
             rows = self.began_late & (before == i) & (self.skill == j)
             ends = self.age[rows] + self.whole_steps[self.choice[rows]]
             needed[i, j] = np.quantile(ends, 0.5, method="higher")
-        limit, steps = self.time_limit, self.steps
-        return Handover(self.skills, calls, did, late, by_itself, limit, needed, steps)
+        else_cut = known & ~self.began_late & self.was_cut
+        else_cut &= self.age + self.tau != self.time_limit
+        return Handover(
+            self.skills,
+            calls,
+            did,
+            late,
+            by_itself,
+            self.time_limit,
+            needed,
+            self.steps,
+            int(else_cut.sum()),
+        )
 
     def _too_late(self, calls: Array) -> str:
         """Return words on calls (k,) that began too late; empty: there are none."""
