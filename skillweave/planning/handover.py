@@ -42,6 +42,8 @@ DOUBTFUL = 0.1
 """A pair with few calls may be weak where it is done so much less often than elsewhere."""
 ALIKE = 0.02
 """Ends are alike where no number has a larger deviation, relative to its range over the log."""
+DIVIDES = 0.7
+"""A number divides calls where this share of those that fail starts outside of the others."""
 SELDOM = 0.25
 """A skill is seldom done where its rate is clearly below."""
 SHOWN = 4
@@ -543,10 +545,12 @@ class Blame:
         first: True if other ends of the first skill would do, so that it is to blame.
         works: where the second skill is clearly more often done: the skill before ("start": none),
             its calls that are done there, and all.
-        differs: the number of the flat observation, of those that the first skill changes, in which
-            the starts of these calls differ most from those after it, its mean there, and here;
-            None: they differ in none.
+        differs: the number of the flat observation, of those that the first skill changes, that
+            divides calls best; the bounds of 90 % of the starts from which the second skill is
+            done anywhere; and the share of the calls that fail here that start outside. None: no
+            number divides them.
         alike: True if all ends of the first skill are alike.
+        stuck: True if nothing changes any more in the last quarter of most calls that failed.
     """
 
     skill: str
@@ -562,8 +566,9 @@ class Blame:
     reasons: dict[str, int]
     first: bool
     works: tuple[tuple[str, int, int], ...] = ()
-    differs: tuple[int, float, float] | None = None
+    differs: tuple[int, float, float, float] | None = None
     alike: bool = False
+    stuck: bool = False
 
     @property
     def fine(self) -> bool:
@@ -587,7 +592,11 @@ class Blame:
             )
             parts.append(f"Of the calls that failed, {words}")
             if self.reasons.get("limit") == failed:
-                parts.append("So they may need more steps (call_steps, max_steps)")
+                parts.append(
+                    "Most stood still before it, so more steps alone would not help"
+                    if self.stuck
+                    else "So they may need more steps (call_steps, max_steps)"
+                )
         if self.fine:
             parts.append("That is no worse than elsewhere, so neither skill is to blame")
         elif self.after == START:
@@ -631,14 +640,14 @@ class Blame:
         )
         text = f"{self.skill!r} works {where}"
         if self.differs is not None:
-            place, there, here = self.differs
+            place, low, high, outside = self.differs
             text += (
-                f", where number {place} of the observation is {there:.2g} at the start of its "
-                f"calls, and {here:.2g} here"
+                f". Where it is done, number {place} of the observation is from {low:.2g} to "
+                f"{high:.2g} at the start; {outside:.0%} of the calls that fail here start outside"
             )
         if self.after == START:
-            return f"{text}; it has to learn to start here, too"
-        ends = "" if self.differs is None else f"{self.after!r} has to end as these do, "
+            return f"{text}. So it has to learn to start here, too"
+        ends = "" if self.differs is None else f"{self.after!r} has to end there, "
         return (
             f"{text}. So {ends}another skill has to come in between, or {self.skill!r} has to "
             f"learn to start where {self.after!r} ends"
@@ -914,7 +923,7 @@ class LinkedCalls(CallColumns):
         works, differs = self._works(won, before, number, rows, starts, changes)
         unknown = Blame(
             skill, after, rate, elsewhere, len(rows), len(others), nan, nan, None, (nan, nan),
-            reasons, False, works, differs,
+            reasons, False, works, differs, stuck=self._stuck(rows[~did]),
         )  # fmt: skip
         if after == START or len(rows) < LEAST:
             return unknown
@@ -945,6 +954,14 @@ class LinkedCalls(CallColumns):
             alike=bool(changes.any() and alike.all()),
         )
 
+    def _stuck(self, calls: Array) -> bool:
+        """Return whether nothing changes in the last quarter of most of these calls (k,)."""
+        last = self.offset[calls + 1] - 1
+        earlier = np.maximum(last - self.tau[calls] // 4, self.offset[calls])
+        end, before = self.flat(self.next_obs[last]), self.flat(self.next_obs[earlier])
+        still = (end == before).all(1) & (earlier < last)
+        return bool(end.size) and bool(still.mean() > 0.5)
+
     def _works(
         self,
         won: Array,
@@ -953,7 +970,7 @@ class LinkedCalls(CallColumns):
         rows: Array,
         starts: Array,
         changes: Array,
-    ) -> tuple[tuple[tuple[str, int, int], ...], tuple[int, float, float] | None]:
+    ) -> tuple[tuple[tuple[str, int, int], ...], tuple[int, float, float, float] | None]:
         """Return ``works`` and ``differs`` of a ``Blame``.
 
         Args:
@@ -964,21 +981,20 @@ class LinkedCalls(CallColumns):
             starts: (C, F) flat observations at the starts of all calls.
             changes: (F,) bool, the numbers that the first skill changes.
         """
-        high = wilson(won[rows].sum(), len(rows))[1]
-        works, there = list[tuple[str, int, int]](), list[Array]()
-        for row in np.unique(before[(before >= 0) & (self.skill == number)]).tolist():
-            some = np.flatnonzero((before == row) & (self.skill == number))
-            done = won[some].sum()
-            if wilson(done, len(some))[0] > high:
-                works.append(((START, *self.skills)[row], int(done), len(some)))
-                there.append(some[won[some]])
+        of_skill = (before >= 0) & (self.skill == number)
+        high, works = wilson(won[rows].sum(), len(rows))[1], list[tuple[str, int, int]]()
+        for row in np.unique(before[of_skill]).tolist():
+            some = of_skill & (before == row)
+            done, calls = int(won[some].sum()), int(some.sum())
+            if wilson(done, calls)[0] > high:
+                works.append(((START, *self.skills)[row], done, calls))
         works.sort(key=lambda entry: -entry[1] / entry[2])
-        if not works:
-            return (), None
-        both = np.concatenate([*there, rows])
-        place, (one, other) = _largest_difference(
-            starts[both], np.arange(len(both)) < len(both) - len(rows), changes
-        )
-        if place is None or np.isclose(one, other):
+        failed = starts[rows[~won[rows]]]
+        if not works or not len(failed) or not changes.any():
             return tuple(works), None
-        return tuple(works), (place, one, other)
+        low, top = np.quantile(starts[of_skill & won], (0.05, 0.95), axis=0)
+        outside = np.where(changes, ((failed < low) | (failed > top)).mean(0), 0.0)
+        place = int(outside.argmax())
+        if outside[place] < DIVIDES:
+            return tuple(works), None
+        return tuple(works), (place, float(low[place]), float(top[place]), float(outside[place]))
