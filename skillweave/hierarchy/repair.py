@@ -281,7 +281,7 @@ def measure(
 
 
 def _sum(one: Handover, other: Handover) -> Handover:
-    added = ("calls", "done", "began_late", "steps")
+    added = ("calls", "done", "began_late", "steps", "cut_else")
     counts = {k: getattr(one, k) + getattr(other, k) for k in added}
     limit = max(one.time_limit, other.time_limit)
     assert one.needed is not None

@@ -42,6 +42,8 @@ DOUBTFUL = 0.1
 """A pair with few calls may be weak where it is done so much less often than elsewhere."""
 ALIKE = 0.02
 """Ends are alike where no number has a larger deviation, relative to its range over the log."""
+DIVIDES = 0.7
+"""A number divides calls where this share of those that fail starts outside of the others."""
 SELDOM = 0.25
 """A skill is seldom done where its rate is clearly below."""
 SHOWN = 4
@@ -71,6 +73,8 @@ class Handover:
         needed: (S + 1, S) int64, the steps of an episode in which half of the calls that began too
             late would have counted, 0: there were none; None: unknown.
         steps: the logged steps; 0: unknown.
+        cut_else: calls that count, and were cut by a truncation before the time limit: they count
+            as they ended.
     """
 
     skills: tuple[str, ...]
@@ -81,6 +85,7 @@ class Handover:
     time_limit: int = 0
     needed: Array | None = None
     steps: int = 0
+    cut_else: int = 0
 
     @property
     def before(self) -> tuple[str, ...]:
@@ -181,7 +186,9 @@ class Handover:
         more = "record more calls"
         if self.steps:
             steps = rounded_up(self.steps * LEAST / int(self.calls[few & worse].min()))
-            more = f"with about {steps:,} logged steps, in place of {self.steps:,}, it has {LEAST}"
+            more = (
+                f"with about {steps:,} logged steps, in place of {self.steps:,}, each has {LEAST}"
+            )
         return [f"Too few calls to say whether a handover is weak: {pairs}; {more}"]
 
     def _without_time(self) -> list[str]:
@@ -263,16 +270,22 @@ class Handover:
 
     @property
     def left_out(self) -> str:
-        """A sentence on the calls that began too late; empty: there were none."""
-        late = int(self.began_late.sum())
-        if not late:
-            return ""
-        few = self._lacks_time
-        more = f". Some pairs have few calls left; {self._more_time(few)}" if few.any() else ""
-        return (
-            f"Left out, as they began too late to run their whole length before the episode's time "
-            f"limit of {self.time_limit:,} steps: {late:,} call{'s' * (late != 1)}{more}."
-        )
+        """Sentences on calls that began too late, or were cut otherwise; empty: there were none."""
+        late, sentences = int(self.began_late.sum()), []
+        if late:
+            few = self._lacks_time
+            more = f". Some pairs have few calls left; {self._more_time(few)}" if few.any() else ""
+            sentences.append(
+                "Left out, as they began too late to run their whole length before the episode's "
+                f"time limit of {self.time_limit:,} steps: {late:,} call{'s' * (late != 1)}{more}."
+            )
+        if self.cut_else:
+            before = f" before step {self.time_limit:,}" if self.time_limit else ""
+            sentences.append(
+                f"In {self.cut_else:,} call{'s' * (self.cut_else != 1)} the environment truncated "
+                f"the episode{before}, which counts as the end of the call."
+            )
+        return " ".join(sentences)
 
     def to_json(self) -> dict[str, Any]:
         """Return the counts, and the sentences of ``weakest``, as plain JSON."""
@@ -532,10 +545,12 @@ class Blame:
         first: True if other ends of the first skill would do, so that it is to blame.
         works: where the second skill is clearly more often done: the skill before ("start": none),
             its calls that are done there, and all.
-        differs: the number of the flat observation, of those that the first skill changes, in which
-            the starts of these calls differ most from those after it, its mean there, and here;
-            None: they differ in none.
+        differs: the number of the flat observation, of those that the first skill changes, that
+            divides calls best; the bounds of 90 % of the starts from which the second skill is
+            done anywhere; and the share of the calls that fail here that start outside. None: no
+            number divides them.
         alike: True if all ends of the first skill are alike.
+        stuck: True if nothing changes any more in the last quarter of most calls that failed.
     """
 
     skill: str
@@ -551,8 +566,9 @@ class Blame:
     reasons: dict[str, int]
     first: bool
     works: tuple[tuple[str, int, int], ...] = ()
-    differs: tuple[int, float, float] | None = None
+    differs: tuple[int, float, float, float] | None = None
     alike: bool = False
+    stuck: bool = False
 
     @property
     def fine(self) -> bool:
@@ -576,7 +592,11 @@ class Blame:
             )
             parts.append(f"Of the calls that failed, {words}")
             if self.reasons.get("limit") == failed:
-                parts.append("So they may need more steps (call_steps, max_steps)")
+                parts.append(
+                    "Most stood still before it, so more steps alone would not help"
+                    if self.stuck
+                    else "So they may need more steps (call_steps, max_steps)"
+                )
         if self.fine:
             parts.append("That is no worse than elsewhere, so neither skill is to blame")
         elif self.after == START:
@@ -620,14 +640,14 @@ class Blame:
         )
         text = f"{self.skill!r} works {where}"
         if self.differs is not None:
-            place, there, here = self.differs
+            place, low, high, outside = self.differs
             text += (
-                f", where number {place} of the observation is {there:.2g} at the start of its "
-                f"calls, and {here:.2g} here"
+                f". Where it is done, number {place} of the observation is from {low:.2g} to "
+                f"{high:.2g} at the start; {outside:.0%} of the calls that fail here start outside"
             )
         if self.after == START:
-            return f"{text}; it has to learn to start here, too"
-        ends = "" if self.differs is None else f"{self.after!r} has to end as these do, "
+            return f"{text}. So it has to learn to start here, too"
+        ends = "" if self.differs is None else f"{self.after!r} has to end there, "
         return (
             f"{text}. So {ends}another skill has to come in between, or {self.skill!r} has to "
             f"learn to start where {self.after!r} ends"
@@ -729,8 +749,19 @@ class LinkedCalls(CallColumns):
             rows = self.began_late & (before == i) & (self.skill == j)
             ends = self.age[rows] + self.whole_steps[self.choice[rows]]
             needed[i, j] = np.quantile(ends, 0.5, method="higher")
-        limit, steps = self.time_limit, self.steps
-        return Handover(self.skills, calls, did, late, by_itself, limit, needed, steps)
+        else_cut = known & ~self.began_late & self.was_cut
+        else_cut &= self.age + self.tau != self.time_limit
+        return Handover(
+            self.skills,
+            calls,
+            did,
+            late,
+            by_itself,
+            self.time_limit,
+            needed,
+            self.steps,
+            int(else_cut.sum()),
+        )
 
     def _too_late(self, calls: Array) -> str:
         """Return words on calls (k,) that began too late; empty: there are none."""
@@ -892,7 +923,7 @@ class LinkedCalls(CallColumns):
         works, differs = self._works(won, before, number, rows, starts, changes)
         unknown = Blame(
             skill, after, rate, elsewhere, len(rows), len(others), nan, nan, None, (nan, nan),
-            reasons, False, works, differs,
+            reasons, False, works, differs, stuck=self._stuck(rows[~did]),
         )  # fmt: skip
         if after == START or len(rows) < LEAST:
             return unknown
@@ -923,6 +954,14 @@ class LinkedCalls(CallColumns):
             alike=bool(changes.any() and alike.all()),
         )
 
+    def _stuck(self, calls: Array) -> bool:
+        """Return whether nothing changes in the last quarter of most of these calls (k,)."""
+        last = self.offset[calls + 1] - 1
+        earlier = np.maximum(last - self.tau[calls] // 4, self.offset[calls])
+        end, before = self.flat(self.next_obs[last]), self.flat(self.next_obs[earlier])
+        still = (end == before).all(1) & (earlier < last)
+        return bool(end.size) and bool(still.mean() > 0.5)
+
     def _works(
         self,
         won: Array,
@@ -931,7 +970,7 @@ class LinkedCalls(CallColumns):
         rows: Array,
         starts: Array,
         changes: Array,
-    ) -> tuple[tuple[tuple[str, int, int], ...], tuple[int, float, float] | None]:
+    ) -> tuple[tuple[tuple[str, int, int], ...], tuple[int, float, float, float] | None]:
         """Return ``works`` and ``differs`` of a ``Blame``.
 
         Args:
@@ -942,21 +981,20 @@ class LinkedCalls(CallColumns):
             starts: (C, F) flat observations at the starts of all calls.
             changes: (F,) bool, the numbers that the first skill changes.
         """
-        high = wilson(won[rows].sum(), len(rows))[1]
-        works, there = list[tuple[str, int, int]](), list[Array]()
-        for row in np.unique(before[(before >= 0) & (self.skill == number)]).tolist():
-            some = np.flatnonzero((before == row) & (self.skill == number))
-            done = won[some].sum()
-            if wilson(done, len(some))[0] > high:
-                works.append(((START, *self.skills)[row], int(done), len(some)))
-                there.append(some[won[some]])
+        of_skill = (before >= 0) & (self.skill == number)
+        high, works = wilson(won[rows].sum(), len(rows))[1], list[tuple[str, int, int]]()
+        for row in np.unique(before[of_skill]).tolist():
+            some = of_skill & (before == row)
+            done, calls = int(won[some].sum()), int(some.sum())
+            if wilson(done, calls)[0] > high:
+                works.append(((START, *self.skills)[row], done, calls))
         works.sort(key=lambda entry: -entry[1] / entry[2])
-        if not works:
-            return (), None
-        both = np.concatenate([*there, rows])
-        place, (one, other) = _largest_difference(
-            starts[both], np.arange(len(both)) < len(both) - len(rows), changes
-        )
-        if place is None or np.isclose(one, other):
+        failed = starts[rows[~won[rows]]]
+        if not works or not len(failed) or not changes.any():
             return tuple(works), None
-        return tuple(works), (place, one, other)
+        low, top = np.quantile(starts[of_skill & won], (0.05, 0.95), axis=0)
+        outside = np.where(changes, ((failed < low) | (failed > top)).mean(0), 0.0)
+        place = int(outside.argmax())
+        if outside[place] < DIVIDES:
+            return tuple(works), None
+        return tuple(works), (place, float(low[place]), float(top[place]), float(outside[place]))

@@ -344,9 +344,8 @@ def call_line(name: str, report: SkillReport, episodes: int) -> str:
 
 def hints(skills: Mapping[str, SkillReport]) -> list[str]:
     """Return a sentence on each probable mistake."""
-    others = {name: report for name, report in skills.items() if not report.cannot_last}
-    instant = [instant_calls(name, skills[name]) for name in skills if name not in others]
-    return [*instant, *idle_calls(skills), *late_calls(others), *hasty_calls(others)]
+    instant = [instant_calls(name, one) for name, one in skills.items() if one.cannot_last]
+    return [*instant, *idle_calls(skills), *late_calls(skills), *hasty_calls(skills)]
 
 
 def instant_calls(name: str, report: SkillReport) -> str:

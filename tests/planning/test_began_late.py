@@ -82,6 +82,16 @@ def test_without_a_time_limit_all_calls_count(episodes):
     assert not any(late_of(episodes))
 
 
+def test_a_truncation_at_another_age_is_an_end_like_others():
+    """Those who leave the track are truncated at once: that is no time limit."""
+    off_track = [full(age, (2, "cut", False)) for age in (1, 2, 5)]
+    log = log_of(["a", "b"], [RAN_OUT, *off_track, full(8, (2, "cut", True))], limits=(None, 4))
+    assert log.began_late[log.skill == B].tolist() == [False] * 4 + [True]
+    matrix = log.handover()
+    assert (matrix.of("b", "a"), matrix.cut_else) == ((0.0, 4), 3)
+    assert "In 3 calls the environment truncated the episode before step 10" in str(matrix)
+
+
 def test_what_counts_does_not_depend_on_the_outcome():
     """Calls of 20 steps fall or not; whatever happens in late ones, the matrix is the same."""
     rng = np.random.default_rng(0)

@@ -44,11 +44,10 @@ def test_the_second_must_learn_where_no_end_would_do():
     assert "From the best third of the ends of 'a' it is done in 0% of 40 calls" in str(found)
     # It works from 5, where no call of "a" ends.
     assert found.works == (("start", 120, 120),)
-    assert found.differs == (0, 5.0, pytest.approx(0.5, abs=0.1))
-    assert "'b' works at the start of an episode (100% of 120 calls (97% to 100%)), where" in (
-        str(found)
-    )
-    assert "So 'a' has to end as these do, another skill has to come in between, or" in str(found)
+    assert found.differs == (0, 5.0, 5.0, 1.0)
+    assert "'b' works at the start of an episode (100% of 120 calls (97% to 100%))." in str(found)
+    assert "number 0 of the observation is from 5 to 5 at the start; 100% of the" in str(found)
+    assert "So 'a' has to end there, another skill has to come in between, or" in str(found)
     assert "So they may need more steps (call_steps, max_steps)" in str(found)
 
 
@@ -73,11 +72,39 @@ def test_ends_that_are_alike_do_not_say_whether_others_would_do(noise):
     assert found.alike == (noise < 0.1)
     assert ("All ends of 'a' are alike" in str(found)) == found.alike
     assert found.works == (("c", 60, 60),)
-    assert "after 'c' (100% of 60 calls (94% to 100%)), where number 0 of the observation is 0" in (
-        str(found)
-    )
+    assert "'b' works after 'c' (100% of 60 calls (94% to 100%)). Where" in str(found)
+    assert found.differs == (0, 0.0, 0.0, 1.0)
     assert "would not help" not in str(found)
     assert "more steps" not in str(found)
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_calls_that_stand_still_at_their_limit_need_no_more_steps(moves):
+    rng, episodes = np.random.default_rng(0), []
+    for _ in range(40):
+        way = [float(rng.random()) + 0.1 * step * moves for step in range(8)]
+        way = way if moves else way[:1] * 8
+        episodes.append((5.0, [(A, [3.0, way[0]], True, "own"), (B, way, False, "limit")]))
+    found = log_of(["a", "b"], episodes).blame("b", "a")
+    assert found.stuck == (not moves)
+    assert ("may need more steps" in str(found)) == moves
+    assert ("Most stood still before it" in str(found)) == (not moves)
+
+
+def test_the_number_that_divides_calls_is_named_though_the_means_are_alike():
+    """``b`` works near 0 alone; ``a`` ends on both sides, and in any place of number 1."""
+    rng, episodes = np.random.default_rng(0), []
+    for i in range(200):
+        end = [float(rng.uniform(-1, 1)), float(rng.uniform(-1, 1))]
+        if i % 2:
+            end = [float(rng.uniform(-0.1, 0.1)), 0.3]
+        won = abs(end[0]) < 0.1
+        b = (B, [end], won, "own" if won else "limit")
+        episodes.append(([5.0, 5.0], [(2 if i % 2 else A, [end], True, "own"), b]))
+    found = log_of(["a", "b", "c"], episodes, size=2).blame("b", "a")
+    place, low, high, outside = found.differs
+    assert (place, outside) == (0, 1.0)
+    assert -0.1 < low < high < 0.1
 
 
 def test_what_the_first_skill_does_not_change_is_no_reason_to_end_elsewhere():

@@ -182,7 +182,7 @@ def test_noise_is_seldom_called_weak():
 
 def test_few_calls_say_how_many_steps_it_takes():
     found = matrix({(1, 1): (2, 4), (0, 1): (40, 40), (0, 0): (40, 40)}, steps=3_000).weakest()
-    assert "with about 15,000 logged steps, in place of 3,000, it has 20" in found[0]
+    assert "with about 15,000 logged steps, in place of 3,000, each has 20" in found[0]
 
 
 def test_pairs_without_time_are_named():
@@ -240,7 +240,7 @@ def test_what_counts_without_a_success_is_said(log):
     assert matrix.by_itself == ()
     assert "A call is done if it succeeded." in str(matrix)
     assert str(matrix).endswith("time limit of 6 steps: 1 call.")
-    assert not replace(log, known_time_limit=0).handover().left_out
+    assert "time limit" not in replace(log, known_time_limit=0).handover().left_out
     some = replace(log, own_success=(True, False))
     assert "without success() (stay) if it ended by itself." in str(some.handover())
     none = replace(log, own_success=(False, False)).handover()

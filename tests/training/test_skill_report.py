@@ -211,6 +211,57 @@ def told(choose, *kinds, call_steps=50):
     return policy, evaluate(policy, EnvSpec(Walk), episodes=20)
 
 
+class AtOnce(Far):
+    """Its termination is always true, so that it never gets to 4."""
+
+    name = "at_once"
+
+    def termination(self, step):
+        return np.ones(len(step.reward), bool)
+
+    def success(self, step):
+        return step.next_obs[:, POSITION] >= 4
+
+
+class Nod(AtOnce):
+    """One step is all that it does, and it has no success."""
+
+    name = "nod"
+    success = Skill.success
+
+
+def test_a_termination_that_is_always_true_is_told():
+    found = told(by_turns, AtOnce, Left)[1]
+    calls = found.skills["at_once"].calls
+    sentence = (
+        f"Every call of 'at_once' ({calls:,}) ended after one step: its termination() is true "
+        "there. If that is so everywhere, its condition is wrong, and no call can do more."
+    )
+    assert sentence in found.for_people().splitlines()
+    assert useless_skills(found.skills, 20, selector_learns=True)[0] == sentence
+
+
+@pytest.mark.parametrize("kind", [Move, Nod, Far])
+def test_moves_of_one_step_are_right(kind):
+    found = told(by_turns, kind, Left)[1]
+    assert "ended after one step: its termination" not in found.for_people()
+
+
+def test_episodes_in_which_a_skill_never_began_are_counted():
+    class Later(Far):
+        def initiation(self, obs):
+            return (obs[:, TAG] % 2 == 0) & (obs[:, T] == 0)
+
+    found = evaluate(SkillAlone(skills_of(Later()), "later"), EnvSpec(Walk), episodes=20)
+    began = found.skills["later"].calls
+    assert 0 < began < 20
+    assert f"in {20 - began} of 20 episodes it never began, as its initiation() was False" in (
+        str(found)
+    )
+    always = evaluate(SkillAlone(skills_of(Far()), "far"), EnvSpec(Walk), episodes=20)
+    assert "never began" not in str(always)
+
+
 def first(obs):
     return np.zeros(len(obs), np.int64)
 
