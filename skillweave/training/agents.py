@@ -63,10 +63,10 @@ class Agents:
         first = entry.decides or entry.learns[0]
         self.level = level_of(first)
         self.roles = self.task.roles or {first: self.task.role}
-        file, place = str(stage.run.path / "run.json"), f"{entry.name}: together"
-        self.together = (
-            None if entry.together is None else fit(Together, entry.together, file, place)
-        )
+        self.together: Together | None = None
+        if entry.together is not None:
+            file = str(stage.run.path / "run.json")
+            self.together = fit(Together, entry.together, file, f"stage {entry.name!r}: together")
         self._resources = ExitStack()
         self._make_collectors = make_collectors
 

@@ -80,7 +80,7 @@ WRONG: dict[str, Callable[[], bytes]] = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_archive_is_refused_in_a_sentence(name: str) -> None:
-    with pytest.raises(PolicyError, match="."):
+    with pytest.raises(PolicyError, match=r"\w"):
         dict(unzipped(WRONG[name](), 1_000_000))
 
 
@@ -151,5 +151,5 @@ NO_ARRAYS = {
 
 @pytest.mark.parametrize("content", NO_ARRAYS.values(), ids=NO_ARRAYS)
 def test_what_is_no_array_of_numbers_is_refused_in_a_sentence(content: bytes) -> None:
-    with pytest.raises(PolicyError, match="."):
+    with pytest.raises(PolicyError, match=r"\w"):
         numbers_in(content)
