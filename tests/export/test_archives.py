@@ -1,4 +1,4 @@
-"""Archives and arrays that others made: refused in a sentence, and bounded before they are unpacked."""
+"""Archives and arrays that others made: bounded before they are unpacked, refused in a sentence."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def damaged() -> bytes:
 
 
 def twice() -> bytes:
-    with pytest.warns(UserWarning, match="Duplicate name"):
-        file = io.BytesIO()
-        with zipfile.ZipFile(file, "w") as archive:
-            archive.writestr("a", b"1")
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("a", b"1")
+        with pytest.warns(UserWarning, match="Duplicate name"):
             archive.writestr("a", b"2")
     return file.getvalue()
 
