@@ -151,7 +151,8 @@ PPO = ON_POLICY | {
     "compile": COMPILE,
 }  # fmt: skip
 OFF_POLICY = {
-    "num_envs": Kind(MILLION.refused, (8, np.int64(8))), "train_freq": AT_LEAST_ONE, "update_ratio": POSITIVE,
+    "num_envs": Kind(MILLION.refused, (8, np.int64(8))), "train_freq": AT_LEAST_ONE,
+    "update_ratio": POSITIVE,
     "buffer_size": Kind(whole(1, 10**9).refused, (1000, np.int64(1000))), "learning_starts": COUNT,
     "batch_size": whole(1, 1_000_000), "n_step": MILLION, "prioritized": FLAG,
     "priority_alpha": FRACTION, "priority_beta": FRACTION, "learning_rate": RATE,

@@ -128,7 +128,9 @@ def train(
             after = course.train(stages[len(apart) :], policies)
             policies = select_best(roles, level, course, policies, after)
     roles = resolve_greedy(roles, run)
-    return assembled(roles, _repaired(roles, course, policies))
+    policy = assembled(roles, _repaired(roles, course, policies))
+    check_parts(roles, policy, str(run.path))
+    return policy
 
 
 def _repaired(roles: Roles, course: Course, policies: Policies) -> Policies:

@@ -237,7 +237,15 @@ def check_parts(roles: Roles, policy: HierarchyPolicy, where: str) -> None:
         seen = without_goal(seen)
     for path, part in parts_of(roles, policy).items():
         role = roles.by_path.get(path)
-        if role is None or role.kind == "critic":
+        if role is None:
+            continue
+        if role.kind == "critic":
+            critic: Any = part
+            if not getattr(critic.algorithm.config, "deciding", False):
+                raise RunError(
+                    f"{where}: {path!r} has not learnt what a new decision is worth, which "
+                    "hierarchy.interrupt needs"
+                )
             continue
         action_space = acts if role.choices is None else role.action_space
         goal_space = role.own_goals if role.skill is None else role.skill.goal_space

@@ -38,7 +38,7 @@ def cost(kind: type[Any], values: Values) -> int:
 def _space(values: Values) -> int:
     if values.get("parts") is not None:
         return 0
-    size = prod(values.get("shape", ()))
+    size: int = prod(values.get("shape", ()))
     if size > MOST:  # it is refused
         return 0
     # Choices are lists of Python's numbers.
@@ -55,7 +55,8 @@ def _deployed(values: Values) -> int:
 
 def _network(values: Values) -> int:
     noise = sum(max(0, width) for _, width in values.get("noise", ()))
-    memory, choices = values.get("memory", 0), values.get("choices", 0)
+    memory: int = values.get("memory", 0)
+    choices: int = values.get("choices", 0)
     return _session(values["file"]) + 16 * memory + 32 * noise + 16 * choices
 
 
@@ -64,8 +65,8 @@ def _session(file: bytes) -> int:
 
 
 def _mapped(values: Values) -> int:
-    states = sum(prod(shape) for shape, _ in values["model"].states)
-    actions = min(values.get("chunk") or 1, LONGEST)
+    states: int = sum(prod(shape) for shape, _ in values["model"].states)
+    actions: int = min(values.get("chunk") or 1, LONGEST)
     return 32 * states + 4 * actions * _bytes(values["outputs"].space)
 
 

@@ -324,8 +324,8 @@ def _fits(kind: Any, origin: Any, inner: tuple[Any, ...], entry: Any) -> bool:
         return set(given) == {name} and isinstance(given[name], str)
     if origin is dict:
         return isinstance(entry, dict) and "type" not in entry
-    name = given.get("type")
-    return isinstance(name, str) and name in _types(kind)
+    typed = given.get("type")
+    return isinstance(typed, str) and typed in _types(kind)
 
 
 def _wanted(kind: Any, origin: Any, inner: tuple[Any, ...]) -> str:

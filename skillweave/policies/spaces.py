@@ -55,6 +55,8 @@ class Space:
             if not self.parts or self.kind not in ("Dict", "Tuple"):
                 names = shown(list(self.parts or ()))
                 raise PolicyError(f"a space is a {self.kind} of the parts {names}")
+            if "" in self.parts:
+                raise PolicyError(f"a {self.kind} has a part without a name")
             return
         if any(n < 0 for n in self.shape) or np.prod(self.shape, dtype=float) > MOST:
             raise PolicyError(

@@ -21,11 +21,12 @@ from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
 from skillweave.envs.checks import longest_evaluation
 from skillweave.envs.engine import Engine
-from skillweave.errors import DeclarationError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.acting import Acting, Request
 from skillweave.experience.collector import Collector
 from skillweave.ops.device import resolve_device
 from skillweave.ops.threads import torch_threads
+from skillweave.policies.files import shown
 from skillweave.runs.initial_policies import initial_policy
 from skillweave.runs.manifest import StageEntry
 from skillweave.schema import fit
@@ -63,10 +64,15 @@ class Agents:
         first = entry.decides or entry.learns[0]
         self.level = level_of(first)
         self.roles = self.task.roles or {first: self.task.role}
-        file, place = str(stage.run.path / "run.json"), f"{entry.name}: together"
-        self.together = (
-            None if entry.together is None else fit(Together, entry.together, file, place)
-        )
+        file = str(stage.run.path / "run.json")
+        if unknown := [name for name in entry.learns if name not in self.roles]:
+            raise RunError(
+                f"{file}: stage {entry.name!r}: learns has {shown(unknown[0])}; it must be of "
+                f"{', '.join(self.roles)}"
+            )
+        self.together: Together | None = None
+        if entry.together is not None:
+            self.together = fit(Together, entry.together, file, f"stage {entry.name!r}: together")
         self._resources = ExitStack()
         self._make_collectors = make_collectors
 

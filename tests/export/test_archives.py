@@ -1,4 +1,4 @@
-"""Archives and arrays that others made: refused in a sentence, and bounded before they are unpacked."""
+"""Archives and arrays that others made: bounded before they are unpacked, refused in a sentence."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def damaged() -> bytes:
 
 
 def twice() -> bytes:
-    with pytest.warns(UserWarning, match="Duplicate name"):
-        file = io.BytesIO()
-        with zipfile.ZipFile(file, "w") as archive:
-            archive.writestr("a", b"1")
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("a", b"1")
+        with pytest.warns(UserWarning, match="Duplicate name"):
             archive.writestr("a", b"2")
     return file.getvalue()
 
@@ -80,7 +80,7 @@ WRONG: dict[str, Callable[[], bytes]] = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_archive_is_refused_in_a_sentence(name: str) -> None:
-    with pytest.raises(PolicyError, match="."):
+    with pytest.raises(PolicyError, match=r"\w"):
         dict(unzipped(WRONG[name](), 1_000_000))
 
 
@@ -151,5 +151,5 @@ NO_ARRAYS = {
 
 @pytest.mark.parametrize("content", NO_ARRAYS.values(), ids=NO_ARRAYS)
 def test_what_is_no_array_of_numbers_is_refused_in_a_sentence(content: bytes) -> None:
-    with pytest.raises(PolicyError, match="."):
+    with pytest.raises(PolicyError, match=r"\w"):
         numbers_in(content)

@@ -22,7 +22,9 @@ from reference_calls import (
 from toys import skills_of
 
 from skillweave import EnvSpec, Skill, evaluate
+from skillweave.errors import RunError
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
+from skillweave.schema import fit
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.skills.skill_set import SkillSet
 from skillweave.training.evaluation import FIRST_SEED
@@ -619,3 +621,13 @@ def test_moves_that_have_no_reward_of_their_own_are_not_hasty():
     there = told(by_turns, Move, Left)[1].skills["move"]
     assert there.calls > 20 > 0 > there.return_sum  # the environment's
     assert there.hasty == 0
+
+
+def test_a_file_with_other_ends_of_calls_is_refused() -> None:
+    ends = {"own": 2, "limit": 0, "interrupted": 0, "episode": 1}
+    data = {"steps": 9, "calls": 3, "succeeded": None, "return_sum": None}
+    for right in (ends, {}):
+        assert fit(SkillReport, data | {"ended": right}, "evaluation.json").ended == right
+    for wrong in ({"own": 3}, ends | {"other": 0}, ends | {"own": -1}):
+        with pytest.raises(RunError, match=r"evaluation\.json: ended"):
+            fit(SkillReport, data | {"ended": wrong}, "evaluation.json")
