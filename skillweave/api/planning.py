@@ -159,17 +159,21 @@ def mission_words(declared: Declaration, given: Mapping[str, Any]) -> dict[str, 
     return {**own, **declared.predicates, **given}
 
 
-def lacking_features(declared: Declaration, policy: Policy) -> str:
-    """Return a sentence if skills see images, which plans cannot compare; it may be empty.
+def lacking_features(declared: Declaration, policy: Policy, skill: str | None = None) -> str:
+    """Return a sentence if skills see images, by which calls cannot be compared; it may be empty.
 
     Args:
         policy: with the skills, of the whole hierarchy or of one level.
+        skill: the name of the one that counts; None: all do.
     """
-    skills = skills_below(policy)
-    if skills is None or declared.features is not None or None not in seen_places(skills):
+    skills, features = skills_below(policy), declared.features
+    if skills is None or not obs_codec(declared.spec.spaces.observation).images:
         return ""
-    images = obs_codec(declared.spec.spaces.observation).images
-    return f"plans cannot compare calls by images; {FEATURES}" if images else ""
+    for one, places in zip(skills.skills, seen_places(skills), strict=True):
+        own = features.get(one.name) if isinstance(features, Mapping) else features
+        if places is None and own is None and skill in (None, one.name):
+            return f"calls of {one.name!r} cannot be compared by images; {FEATURES}"
+    return ""
 
 
 def untasked(spec: EnvSpec) -> EnvSpec:

@@ -194,7 +194,7 @@ def _measured(
     """
     level = parts_of(roles, policy)[level_of(skill)]
     assert isinstance(level, HierarchyPolicy)
-    if words := lacking_features(declared, level):
+    if words := lacking_features(declared, level, name_of(skill)):
         raise DeclarationError(words)
     names = name_of(skill), name_of(after)
     found = measure(roles.spec, level.skills, *names, done, calls, num_envs, progress.message)

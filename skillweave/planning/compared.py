@@ -75,15 +75,20 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
 
 
 def feature_maps(
-    log: CallColumns, features: Any, known: Array, task: RewardMachine | None = None
-) -> list[FeatureMap]:
-    """Return the features of each skill.
+    log: CallColumns,
+    features: Any,
+    known: Array,
+    task: RewardMachine | None = None,
+    skills: Sequence[int] | None = None,
+) -> dict[int, FeatureMap]:
+    """Return the features of skills, by their places in the log.
 
     Args:
         log: the calls.
         features: for all skills, or by skill; None: the log's own, else the ``compared_places``.
         known: logged observations.
         task: see ``compared_places``.
+        skills: the places of those that are compared; None: all.
     """
     places, names = compared_places(log, task), log.skills
     features = log.features if features is None else features
@@ -93,15 +98,15 @@ def feature_maps(
             raise DeclarationError(
                 f"features= names {short(name)}, which is no skill of the log{suggest(name, names)}"
             )
-    return [
-        FeatureMap(
+    return {
+        i: FeatureMap(
             log.observation_space,
-            seen if by_skill.get(name) is None else by_skill[name],
+            places[i] if by_skill.get(names[i]) is None else by_skill[names[i]],
             known,
-            f"skill {name!r}",
+            f"skill {names[i]!r}",
         )
-        for name, seen in zip(names, places, strict=True)
-    ]
+        for i in (range(len(names)) if skills is None else skills)
+    }
 
 
 def _help(

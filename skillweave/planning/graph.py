@@ -121,7 +121,8 @@ class CallGraph:
             log = log.take(evenly(np.arange(len(log)), MOST_CALLS))
         self.log, self.neighbors, self.skills = log, neighbors, skills
         self.pieces = pieces = _pieces(log, skills)
-        self.maps = feature_maps(log, features, np.concatenate([log.start, log.end]), task)
+        known = np.concatenate([log.start, log.end])
+        self.maps = [*feature_maps(log, features, known, task).values()]
         aims = [_standard_goals(log, name) for name in log.skills]
         groups = tuple(self._groups(log.before[pieces.first], aims))
         self.options = Options(groups, tuple(aims), neighbors, log.lengths)

@@ -809,7 +809,8 @@ class LinkedCalls(CallColumns):
                     + self._too_late(with_late)
                     + "; record more calls, chosen at random"
                 )
-        maps = feature_maps(self, features, np.concatenate([self.start, self.end]))
+        seen = np.concatenate([self.start, self.end])
+        maps = feature_maps(self, features, seen, skills=numbers[1:] or numbers)
         links = list[tuple[Array, Array]]()
         for i, (some, following) in enumerate(pairwise(rows)):
             here = maps[numbers[i + 1]]
@@ -927,7 +928,7 @@ class LinkedCalls(CallColumns):
         )  # fmt: skip
         if after == START or len(rows) < LEAST:
             return unknown
-        maps = feature_maps(self, features, self.start)
+        maps = feature_maps(self, features, self.start, skills=[number])
         known = np.flatnonzero(counts & ~self.began_late)
         # Where a number that the first skill does not change decides, none of its ends is better.
         score = _predicted(maps[number](self.start), won, known, rows)
@@ -956,11 +957,13 @@ class LinkedCalls(CallColumns):
 
     def _stuck(self, calls: Array) -> bool:
         """Return whether nothing changes in the last quarter of most of these calls (k,)."""
+        if not len(calls):
+            return False
         last = self.offset[calls + 1] - 1
         earlier = np.maximum(last - self.tau[calls] // 4, self.offset[calls])
         end, before = self.flat(self.next_obs[last]), self.flat(self.next_obs[earlier])
         still = (end == before).all(1) & (earlier < last)
-        return bool(end.size) and bool(still.mean() > 0.5)
+        return end.size > 0 and 2 * int(still.sum()) > len(calls)
 
     def _works(
         self,

@@ -98,8 +98,8 @@ class FeatureMap:
         if self._codec is not None:
             if self._codec.images and features is None:
                 raise DeclarationError(
-                    f"{who} sees images, and images have no distance that means something; "
-                    + FEATURES
+                    f"{who} sees images, or what a function makes of them, and images have no "
+                    f"distance that means something; {FEATURES}"
                 )
             self.places = self._checked_places(features, self._codec.size)
         raw = self.raw(known)
