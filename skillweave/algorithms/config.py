@@ -34,7 +34,7 @@ from skillweave.schema import (
 )
 
 MOST_ROWS = 1_000_000_000
-"""The most steps that a rollout or a buffer holds."""
+"""The most steps that a buffer holds."""
 Rows = Annotated[int, Check(f"at least 1 and at most {MOST_ROWS:,}", lambda x: 1 <= x <= MOST_ROWS)]
 """A number of steps that are held in memory."""
 
@@ -70,9 +70,6 @@ class OnPolicy:
     def __post_init__(self) -> None:
         check_critic(self)
         check_rate(self)
-        rows = self.num_envs * self.n_steps
-        rule = f"at most {MOST_ROWS // self.num_envs:,} with {self.num_envs:,} environments"
-        check(self, "n_steps", rows <= MOST_ROWS, rule)
 
 
 @settings

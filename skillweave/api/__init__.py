@@ -144,7 +144,7 @@ class Agent(Trainable, PlainAgent):
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Agent:
         """Return the agent of a run's ``manifest`` (``run.json``), without the user's code."""
-        recorded = manifest_in(manifest)
+        recorded = manifest_in(manifest, "run.json")
         (stage,) = recorded.stages
         agent = cls(spec_of(recorded), config_from_json(stage.algorithm), stage.budget)
         agent.recorded = True
@@ -240,7 +240,7 @@ class Hierarchy(Trainable, Declaration):
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:
         """Return the hierarchy of a run's ``manifest``, without the user's code."""
-        recorded = manifest_in(manifest)
+        recorded = manifest_in(manifest, "run.json")
         spec = spec_of(recorded)
         skills: dict[str, list[Skill]] = {}  # by the path of their level
         rests: dict[str, Any] = {}  # as well

@@ -57,7 +57,8 @@ def _network(values: Values) -> int:
     noise = sum(max(0, width) for _, width in values.get("noise", ()))
     memory: int = values.get("memory", 0)
     choices: int = values.get("choices", 0)
-    return _session(values["file"]) + 16 * memory + 32 * noise + 16 * choices
+    numbers: int = 16 * memory + 32 * noise + 16 * choices
+    return _session(values["file"]) + numbers
 
 
 def _session(file: bytes) -> int:
@@ -67,11 +68,13 @@ def _session(file: bytes) -> int:
 def _mapped(values: Values) -> int:
     states: int = sum(prod(shape) for shape, _ in values["model"].states)
     actions: int = min(values.get("chunk") or 1, LONGEST)
-    return 32 * states + 4 * actions * _bytes(values["outputs"].space)
+    numbers: int = 32 * states + 4 * actions * _bytes(values["outputs"].space)
+    return numbers
 
 
 def _take(values: Values) -> int:
-    return 32 * sum(max(0, count) for count, _ in values.get("choices", ()))
+    options: int = sum(max(0, count) for count, _ in values.get("choices", ()))
+    return 32 * options
 
 
 def _hierarchy(values: Values) -> int:

@@ -481,7 +481,9 @@ def test_absurd_spaces_are_refused_with_their_size_before_anything_is_made(tmp_p
 
 
 def test_a_rollout_that_does_not_fit_into_memory_is_refused(tmp_path):
-    h = Hierarchy("CartPole-v1", [Plain()], algorithm=PPO(n_steps=10**12), learn="apart")
+    h = Hierarchy(
+        "CartPole-v1", [Plain()], algorithm=PPO(n_steps=10**6, num_envs=10**6), learn="apart"
+    )
     with pytest.raises(SkillweaveError, match=r"a rollout of .*lower num_envs or n_steps"):
         h.train(tmp_path / "run")
 

@@ -431,8 +431,4 @@ def test_nothing_in_the_library_pickles_or_runs_text_as_code() -> None:
     assert len(found.pop("workers/channel.py")) == 1
     channel = (LIBRARY / "workers/channel.py").read_text()
     assert not re.search(r"\bopen\(|\.load\(", channel)
-    # What acts stands alone, and reads the arrays of exports: NumPy refuses objects in them.
-    (line,) = found.pop("policies/codec.py")
-    assert line.endswith("np.load")
-    assert "allow_pickle" not in (LIBRARY / "policies/codec.py").read_text()
     assert {k: v for k, v in found.items() if v} == {}
