@@ -401,7 +401,7 @@ mine.log({"x": 2}, step=2)
 wandb.log({"x": 3}, step=3)
 assert wandb.run is mine
 assert (mine.name, mine.project, dict(mine.config)) == ("mine", "mine", {"lr": 1})
-assert mine.summary["x"] == 3
+assert mine.step == 3
 assert not any("agent" in key for key in dict(mine.summary))
 mine.finish()
 """
