@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-from skillweave._internal.messages import suggest
+from skillweave._internal.messages import ELSEWHERE, suggest
 from skillweave.algorithms.config import AlgorithmConfig, named_config
 from skillweave.algorithms.schedules import Linear
 from skillweave.api.running import apart_to_evolve
@@ -40,6 +40,9 @@ Changes = dict[tuple[str, ...], tuple[str, str]]
 """By the path of a field, the setting's full name and the text of its value."""
 SELECTIONS: dict[str, Any] = {"tournament": Tournament, "truncation": Truncation}
 
+
+MOST_SHOWN = 4
+"""The most settings that an error lists."""
 
 _PART = re.compile(r"(skills\.[^.]+|together)\.steps|apart\.(skill|selector)_steps")
 """Names of the budgets of parts."""
@@ -291,5 +294,11 @@ def _parse(name: str, text: str, hint: Any) -> Any:
 
 
 def _unknown(name: str, known: Sequence[str]) -> DeclarationError:
-    end = suggest(name, known, listed=False)
+    last = ELSEWHERE.get(name, name)
+    longer = [k for k in known if k.rpartition(".")[2] == last != k]
+    if longer and name not in known:
+        more = ", ..." if len(longer) > MOST_SHOWN else ""
+        end = f"; there are {', '.join(longer[:MOST_SHOWN])}{more}"
+    else:
+        end = suggest(name, known, listed=False)
     return DeclarationError(f"no setting {name!r}{end} (skillweave info RECIPE lists them)")

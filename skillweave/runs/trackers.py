@@ -142,7 +142,7 @@ class WandB(Tracker):
         if self._is_outer:
             self._run: Any = outer
             return
-        beside = {} if outer is None else {"reinit": "create_new"}
+        beside: dict[str, Any] = {} if outer is None else {"reinit": "create_new"}
         try:
             self._run = wandb.init(
                 project=WANDB_PROJECT,

@@ -611,6 +611,8 @@ MISTAKES: dict[str, tuple[list[str], int, list[str]]] = {
     "recipe": (["train", "lunar-landr"], 1, ["'lunar-landr'", "is 'lunar-lander' meant?"]),
     "recipe file": (["train", "nowhere.py"], 1, ["'nowhere.py'", "lunar-lander"]),
     "setting": (["train", "PLAIN", "--set", "selector.gama=0.9"], 1, ["selector.gamma"]),
+    "setting alone": (["train", "PLAIN", "--set", "gamma=0.9"], 1, ["skills.left.gamma"]),
+    "rate alone": (["train", "PLAIN", "--set", "lr=1"], 1, ["selector.learning_rate"]),
     "plain setting": (["train", "PLAIN", "--set", "call_step=9"], 1, ["call_steps"]),
     "skill's setting": (["train", "PLAIN", "--set", "skills.lef.steps=9"], 1, ["'lef'", "left"]),
     "no value": (["train", "PLAIN", "--set", "call_steps"], 1, ["name=value"]),

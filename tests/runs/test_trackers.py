@@ -387,6 +387,48 @@ def test_wandb_without_a_login_works_offline_and_asks_for_nothing(tmp_path: Path
     assert film.read_bytes().startswith(b"GIF89a")
 
 
+BESIDE = """
+import sys
+import wandb
+from skillweave import PPO, Network, train_agent
+
+small = PPO(num_envs=2, n_steps=8, batch_size=16, network=Network((4,)))
+mine = wandb.init(project="mine", name="mine", config={"lr": 1}, dir=sys.argv[1])
+mine.log({"x": 1}, step=1)
+for steps in (32, 64):  # the second time, the run's folder has the links of W&B
+    train_agent("CartPole-v1", small, steps, sys.argv[2], track=["wandb"], resume=True, quiet=True)
+mine.log({"x": 2}, step=2)
+wandb.log({"x": 3}, step=3)
+assert wandb.run is mine
+assert (mine.name, mine.project, dict(mine.config)) == ("mine", "mine", {"lr": 1})
+assert mine.step == 3
+assert not any("agent" in key for key in dict(mine.summary))
+mine.finish()
+"""
+
+
+@pytest.mark.slow
+def test_a_training_beside_a_run_of_wandb_is_continued_in_a_run_of_its_own(tmp_path: Path) -> None:
+    if importlib.util.find_spec("wandb") is None:
+        pytest.skip("wandb is not installed")
+    (tmp_path / "mine").mkdir()
+    line = [
+        sys.executable,
+        "-W",
+        "ignore",
+        "-c",
+        BESIDE,
+        str(tmp_path / "mine"),
+        str(tmp_path / "r"),
+    ]
+    env = os.environ | {"WANDB_MODE": "offline", "WANDB_SILENT": "true"}
+    done = subprocess.run(line, capture_output=True, text=True, env=env, check=False)
+    assert done.returncode == 0, done.stderr
+    written = [p.name for p in (tmp_path / "r" / "wandb").glob("offline-run-*/*.wandb")]
+    assert len(written) == 2
+    assert len(set(written)) == 1  # W&B's file is named after the run's id
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_mlflow_goes_on_in_the_same_run_and_shows_each_step_once(
