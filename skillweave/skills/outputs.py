@@ -13,6 +13,7 @@ import numpy as np
 from skillweave._internal.messages import error_text, short, suggest
 from skillweave._internal.tracebacks import is_users
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
+from skillweave.policies.floats import by_program
 from skillweave.policies.infos import NUMBERS, Infos
 from skillweave.skills.probing import probe, watch
 from skillweave.types import LARGEST_REWARD, Array, Step, read_only, wrong_reward
@@ -46,7 +47,9 @@ def called(
     """
     watch(function, argument, more, who, judges)
     try:
-        return function(**argument) if isinstance(argument, dict) else function(argument, *more)
+        if isinstance(argument, dict):
+            return by_program(function, **argument)
+        return by_program(function, argument, *more)
     except SkillweaveError:
         raise
     except (Exception, SystemExit) as error:
