@@ -181,6 +181,38 @@ MISTAKES: dict[str, dict[str, tuple[Callable[[], Any], str]]] = {
         "env raises in step": (lambda: train(Boom), "of its episode: step() raised ValueError"),
         "env returns a wrong shape": (lambda: train(Wrong), "not in its observation_space"),
         "a mask that allows nothing": (lambda: train(Forbids), "allows no action"),
+        "a million one-hot numbers": (
+            lambda: sw.train_agent(lambda: World(gym.spaces.Discrete(1_000_000)), sw.PPO(), 64),
+            "computes with 4,096 observations at once: 16.4 GB",
+        ),
+        "two parts of one name": (
+            lambda: train(
+                lambda: World(
+                    gym.spaces.Dict(
+                        {
+                            "a.b": gym.spaces.Discrete(2),
+                            "a": gym.spaces.Dict(b=gym.spaces.Box(0, 1)),
+                        }
+                    )
+                )
+            ),
+            "two parts",
+        ),
+        "RecordVideo without render_mode": (
+            lambda: train(
+                sw.EnvSpec(
+                    "CartPole-v1",
+                    wrappers=(lambda env: gym.wrappers.RecordVideo(env, "films"),),
+                )
+            ),
+            "kwargs={'render_mode': 'rgb_array'}",
+        ),
+        "a wrong part of a Dict": (
+            lambda: train(
+                type("Off", (Room,), {"see": lambda _: {"place": np.zeros(2, "f4"), "held": 3}})
+            ),
+            "its observation['held'] is 3, which is not in Discrete(3)",
+        ),
         "four values of old gym": (lambda: train(Old), "returned 4 values; Gymnasium needs five"),
         "misspelt keyword of an environment": (
             lambda: train(sw.EnvSpec("CartPole-v1", kwargs={"sutton_bartow_reward": True})),

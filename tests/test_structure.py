@@ -56,7 +56,7 @@ ROOMS: dict[str, set[str]] = {
     "prefixes": set(),
     "messages": {"errors", "types", "tracebacks"},
     "notices": set(),
-    "arguments": {"errors", "types", "messages"},
+    "arguments": {"errors", "types", "messages", "policies"},
     "named": {"errors", "types", "messages"},
     "schema": {"errors", "types", "messages", "arguments", "policies"},
     "_internal": set(),

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 from skillweave._internal.messages import ELSEWHERE, short, suggest
 from skillweave.errors import DeclarationError
+from skillweave.policies.floats import usual_floats
 
 T = TypeVar("T", bound=Callable[..., Any])
 
@@ -83,7 +84,8 @@ def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def checked(*args: Any, **named: Any) -> Any:
         try:
-            return function(*args, **named)
+            with usual_floats():
+                return function(*args, **named)
         except TypeError:
             # The function's body may have raised it: then the arguments fit.
             if (wrong := _wrong_arguments(function, args, named)) is None:

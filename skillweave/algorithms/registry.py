@@ -7,6 +7,7 @@ from dataclasses import is_dataclass
 from typing import Any, cast
 
 from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short
 from skillweave.algorithms.base import REQUIRED, Algorithm
 from skillweave.algorithms.config import (
     BUILT_IN,
@@ -17,8 +18,10 @@ from skillweave.algorithms.config import (
     add_registration,
     registration_of,
 )
-from skillweave.errors import DeclarationError
+from skillweave.errors import DeclarationError, EnvError
 
+MOST_BYTES = 8_000_000_000
+"""The most bytes of the observations of a batch, as float32 numbers."""
 _SETTINGS: dict[str, type[Any]] = {"rollout": OnPolicy, "replay": OffPolicy}
 
 
@@ -76,9 +79,37 @@ def make_algorithm(config: AlgorithmConfig, observation_space: Any, action_space
     Raises:
         DeclarationError: the algorithm is not registered, or cannot act in these spaces; the
             message names algorithms that can.
+        EnvError: a batch of observations would need too much memory.
     """
     kind = registration_of(config).algorithm
     if isinstance(kind, str):
         module, name = kind.split(":")
         kind = getattr(importlib.import_module(module), name)
+    _check_batch(config, observation_space)
     return cast(Algorithm, kind(config, observation_space, action_space))
+
+
+def _check_batch(config: AlgorithmConfig, space: Any) -> None:
+    """Raise an EnvError where the largest batch of observations needs too much memory.
+
+    Images are not counted, as they are smaller than what networks make of them.
+    """
+    network = getattr(config, "network", None)
+    if getattr(network, "sees", None) is not None or getattr(network, "encoder", None) is not None:
+        return
+    from skillweave.spaces import obs_codec
+
+    replay = getattr(config, "batch_size", 1)
+    rows = config.num_envs * config.n_steps if isinstance(config, OnPolicy) else replay
+    most = max(rows, config.num_envs)
+    numbers = obs_codec(space).size
+    needed = most * numbers * 4
+    if needed > MOST_BYTES:
+        smaller = "num_envs or n_steps" if isinstance(config, OnPolicy) else "batch_size"
+        raise EnvError(
+            f"observation space {short(space)} is {numbers:,} numbers to a network, choices "
+            f"one-hot, and {type(config).__name__} computes with {most:,} observations at once: "
+            f"{needed / 1e9:,.1f} GB, more than {MOST_BYTES / 1e9:g}. Wrap the environment so that "
+            "it gives fewer numbers (a position as coordinates, an id as its features), or lower "
+            f"{smaller}"
+        )

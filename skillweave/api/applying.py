@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
+from skillweave._internal.notices import notice
 from skillweave.algorithms.policy import AgentHeader
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
@@ -47,7 +48,9 @@ def load_policy(declared: D, path: Path) -> Trained[D]:
     run = RunDirectory.open(path)
     declared.validate()
     with called_by(declared._caller):
-        declared = apply_manifest(declared, run)
+        given, declared = declared, apply_manifest(declared, run)
+        if isinstance(given, Declaration) and isinstance(declared, Declaration):
+            _notice_limits(roles_of(given), roles_of(declared), run)
         if run.manifest.hierarchy is None:
             return declared, run, load_agent_of(run)
         assert isinstance(declared, Declaration)
@@ -78,6 +81,29 @@ def _recorded_roles(roles: Roles, run: RunDirectory) -> Roles:
         return replace(with_entry(level, entry), skills=skills)
 
     return roles.changed(recorded)
+
+
+def _notice_limits(now: Roles, then: Roles, run: RunDirectory) -> None:
+    """Give a notice where limits of calls are declared otherwise than the run records them."""
+    changed = []
+    for path, level in then.levels.items():
+        whose = f" of {path!r}" if path else ""
+        limits = {f"call_steps{whose}": (level.call_steps, now.levels[path].call_steps)}
+        for name, skill in level.skills.items():
+            declared = now.levels[path].skills[name]
+            for field in ("max_steps", "call_steps"):
+                both = getattr(skill, field), getattr(declared, field)
+                limits[f"{field} of skill {name!r}"] = both
+        changed += [
+            f"{name} is {recorded} (declared now: {declared})"
+            for name, (recorded, declared) in limits.items()
+            if recorded != declared
+        ]
+    if changed:
+        notice(
+            f"{run.path}: calls have the limits with which the run was trained: "
+            f"{', '.join(changed)}. To use the new ones, train again: train(start_from=run)"
+        )
 
 
 def _limited(skill: Skill, entry: SkillEntry) -> Skill:

@@ -22,9 +22,10 @@ from skillweave.envs.image_bounds import ImageBounds
 from skillweave.envs.infos import MASK, observes_mask
 from skillweave.envs.pool import first_row
 from skillweave.errors import EnvError, SkillweaveError
+from skillweave.policies.floats import by_program
 from skillweave.policies.spaces import at, space_of
 from skillweave.spaces import choice_counts, obs_shape
-from skillweave.spaces.packing import leaf_spaces
+from skillweave.spaces.packing import leaf_spaces, parts
 from skillweave.types import LARGEST_REWARD, Array, wrong_reward
 
 LONGEST_EPISODE = 100_000
@@ -160,18 +161,14 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             what = f"{len(values)} values" if many else f"a {type(values).__name__}"
             raise self._wrong(f"{returned} {what}; Gymnasium needs {needed}")
         if not self._fits(values[0]):
-            space = short(self.env.observation_space, 200)
-            raise self._wrong(
-                f"its observation is {_described(values[0])}, which is not in its "
-                f"observation_space {space}"
-            )
+            raise self._wrong(f"its observation{_misfit(self.env.observation_space, values[0])}")
         if not isinstance(values[-1], dict):
             raise self._wrong(f"its info is {short(values[-1])}; it must be a dict")
 
     def _called(self, function: Callable[..., Any], name: str, *args: Any) -> Any:
         """Return the result of a function of the environment."""
         try:
-            return function(*args)
+            return by_program(function, *args)
         except SkillweaveError:
             raise
         except (Exception, SystemExit) as error:
@@ -522,6 +519,36 @@ def _holds(space: gym.Space[Any], obs: Any) -> bool:
         return bool(space.contains(obs))
     except Exception:
         return False
+
+
+def _misfit(space: gym.Space[Any], obs: Any, place: str = "") -> str:
+    """Return the place where an observation does not fit its space, and how, in words.
+
+    Args:
+        place: the part so far, as a user writes it.
+    """
+    inner = parts(space)
+    of_dict = isinstance(space, gym.spaces.Dict)
+    named: Any = None
+    if inner is not None and isinstance(obs, dict if of_dict else tuple | list):
+        named = obs if of_dict else {str(i): part for i, part in enumerate(obs)}
+    if inner is None or named is None:
+        whole = "" if place else "its observation_space "
+        return f"{place} is {_described(obs)}, which is not in {whole}{short(space, 200)}"
+    names = ", ".join(map(short, inner))
+    if lacking := next((name for name in inner if name not in named), None):
+        has = ", ".join(map(short, named)) or "none"
+        return f"{place} lacks the part {short(lacking)} of its space; its parts are {has}"
+    if added := next((name for name in named if name not in inner), None):
+        return (
+            f"{place} has the part {short(added)}, which its space lacks (it has {names}): declare "
+            "the part in observation_space, or leave it out"
+        )
+    for name, part in inner.items():
+        if not _fits(part)(named[name]):
+            at_part = f"[{name!r}]" if of_dict else f"[{name}]"
+            return _misfit(part, named[name], place + at_part)
+    return " is not in its observation_space"
 
 
 def _described(obs: Any) -> str:

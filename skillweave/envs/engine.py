@@ -309,7 +309,8 @@ class GymnasiumEngine(WatchedEngine):
         obs, infos = self._empty(len(ids)), []
         for row, (i, seed) in enumerate(zip(ids.tolist(), self._seed[ids].tolist(), strict=True)):
             observation, info = self.envs[i].reset(seed=seed)
-            put_observation(self.observation_space, obs, row, observation)
+            with np.errstate(over="ignore"):
+                put_observation(self.observation_space, obs, row, observation)
             infos.append(info)
         self._over[ids] = False
         if self._draws.looks:
@@ -335,15 +336,19 @@ class GymnasiumEngine(WatchedEngine):
             result = self.envs[i].step(one)
             observation, reward[row], terminated[row], truncated[row], info = result
             # At once: several environments may share one buffer of observations.
-            if self._dtype.names is not None:
-                put_observation(self.observation_space, obs, row, observation)
-            else:
-                obs[row] = observation
+            try:
+                if self._dtype.names is not None:
+                    put_observation(self.observation_space, obs, row, observation)
+                else:
+                    obs[row] = observation
+            except RuntimeWarning:  # the program's warnings are errors; infinities are named below
+                with np.errstate(over="ignore"):
+                    put_observation(self.observation_space, obs, row, observation)
             infos.append(info)
         self._over[ids] = terminated | truncated
         if self._draws.looks:
             self._notice_draws()
-        paid = reward.astype(np.float32)
+        paid = reward.astype(np.float32)  # CheckedEnv has refused what would be an infinity
         return self._stepped(RawStep(obs, paid, terminated, truncated, batched_infos(infos)), ids)
 
     def finish(self) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import skillweave.toys  # registers their ids  # noqa: F401
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import error_text, short, shortened, suggest
+from skillweave._internal.notices import notice
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.envs.checks import CheckedEnv, is_batched, refuse_batched
 from skillweave.envs.engine import Engine, GymnasiumEngine
@@ -162,33 +163,51 @@ class EnvSpec:
             raise
         except (Exception, SystemExit) as error:
             which = "" if number is None else f" (environment {number})"
-            raise EnvError(f"{self.name}{which} could not be made: {error_text(error)}") from error
+            advice = ""
+            if "render mode is none" in str(error).lower():  # RecordVideo's, for example
+                advice = "; write EnvSpec(..., kwargs={'render_mode': 'rgb_array'})"
+            raise EnvError(
+                f"{self.name}{which} could not be made: {error_text(error)}{advice}"
+            ) from error
         return CheckedEnv(env, self.name, number)
 
     def _unchecked(self, render_mode: str | None) -> gym.Env[Any, Any]:
+        """Make the environment without wrappers; a film's ``render_mode`` goes before kwargs'."""
+        kwargs = dict(self.kwargs)
+        if "render_mode" in kwargs:
+            own = kwargs.pop("render_mode")
+            render_mode = own if render_mode is None else render_mode
+            if render_mode == "human":
+                notice(
+                    f"{self.name}: kwargs has render_mode='human', so each environment draws each "
+                    "step in a window, in training, too: leave it out to train; run.render(...) "
+                    "makes films without it"
+                )
         if isinstance(self.env, str):
-            return self._from_registry(self.env, render_mode)
+            return self._from_registry(self.env, render_mode, kwargs)
         if render_mode is None:
-            return self.env(**self.kwargs)
+            return self.env(**kwargs)
         try:
-            return self.env(render_mode=render_mode, **self.kwargs)
+            return self.env(render_mode=render_mode, **kwargs)
         except TypeError as error:
-            if self.kwargs and "render_mode" not in str(error):
+            if kwargs and "render_mode" not in str(error):
                 raise  # it is about kwargs
             raise EnvError(
                 f"{self.name} cannot be rendered: the function that makes it must take "
                 f"render_mode ({error})"
             ) from error
 
-    def _from_registry(self, env_id: str, render_mode: str | None) -> gym.Env[Any, Any]:
+    def _from_registry(
+        self, env_id: str, render_mode: str | None, kwargs: dict[str, Any]
+    ) -> gym.Env[Any, Any]:
         try:
             try:
-                return gym.make(env_id, render_mode=render_mode, **self.kwargs)
+                return gym.make(env_id, render_mode=render_mode, **kwargs)
             except TypeError as error:
                 word = "unexpected keyword argument 'render_mode'"
                 if render_mode is not None or word not in str(error):
                     raise
-                return gym.make(env_id, **self.kwargs)  # an environment that cannot be rendered
+                return gym.make(env_id, **kwargs)  # an environment that cannot be rendered
         except gym.error.DependencyNotInstalled as error:
             if "box2d" in str(error).lower():
                 raise MissingExtra(f"the environment {env_id}", "box2d") from error

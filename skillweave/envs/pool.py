@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 import inspect
+import os
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -273,6 +275,17 @@ def installed() -> Any:
     Raises:
         MissingExtra: it is not installed.
     """
-    with needs_extra("the EnvPool engine", "envpool"):
-        import envpool as package
+    before = dict(os.environ)
+    if importlib.util.find_spec("envpool") is not None:
+        with suppress(
+            ImportError
+        ):  # EnvPool imports it, after it has set a backend without windows
+            importlib.import_module("matplotlib")
+    try:
+        with needs_extra("the EnvPool engine", "envpool"):
+            import envpool as package
+    finally:  # it sets variables of Matplotlib and pygame, which the whole program would use
+        for name in os.environ.keys() - before.keys():
+            del os.environ[name]
+        os.environ.update(before)
     return package

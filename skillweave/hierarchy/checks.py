@@ -6,6 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from skillweave._internal.messages import short, suggest
+from skillweave._internal.notices import notice
 from skillweave._internal.paths import name_of
 from skillweave.algorithms.config import PPO, AlgorithmSettings
 from skillweave.envs.make import EnvSpec
@@ -156,8 +157,19 @@ def _check_guide(level: Level, guide: Guide) -> None:
 
 
 def _check_calls(level: Level) -> None:
-    """Raise a DeclarationError where calls of skills would never end."""
+    """Raise a DeclarationError where calls of skills would never end.
+
+    Give a notice where a skill seems to have no limit of its calls, and has the hierarchy's.
+    """
     if level.call_steps is not None:
+        for skill in level.skills.values():
+            if _undoes_call_steps(skill):
+                notice(
+                    f"skill {skill.name!r}: call_steps = None lifts no limit of its calls: "
+                    f"it means the hierarchy's call_steps, {level.call_steps}. For calls that last "
+                    "until the skill ends them, give it a large number, call_steps = 10_000, or "
+                    "leave call_steps out to end this message"
+                )
         return
     for skill in level.skills.values():
         if not (skill.max_steps or skill.call_steps or skill.defines("termination")):
@@ -165,6 +177,13 @@ def _check_calls(level: Level) -> None:
                 f"call_steps is None, but skill {skill.name!r} never ends by itself: give it "
                 "max_steps or termination()"
             )
+
+
+def _undoes_call_steps(skill: Skill) -> bool:
+    """Return whether a skill sets call_steps to None where no class above it gives a number."""
+    places = [vars(skill), *map(vars, type(skill).__mro__)]
+    set_to = [place["call_steps"] for place in places if "call_steps" in place]
+    return len(set_to) > 1 and all(value is None for value in set_to)
 
 
 def _check_rest(level: Level) -> None:

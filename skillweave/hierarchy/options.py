@@ -16,6 +16,7 @@ from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import DeclarationError
 from skillweave.policies.core import RUNNING, Turn, World, restart
+from skillweave.policies.floats import usual_floats
 from skillweave.policies.hierarchy import SKILL, unless_none
 from skillweave.policies.parts import GOAL
 from skillweave.policies.spaces import space_of
@@ -63,7 +64,10 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self._seed = seed
         self._obs: Array = np.empty(0)
         self._mask: Array | None = None
+        self._ready = False
+        """It has been reset, and not been closed."""
 
+    @usual_floats()
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -77,8 +81,10 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             Observations (N, *obs_shape), and infos.
 
         Raises:
-            DeclarationError: more than one seed was given.
+            DeclarationError: more than one seed was given, or it is closed.
         """
+        if self.closed:
+            raise DeclarationError("OptionsEnv.reset: it is closed; make another one")
         if isinstance(seed, list):
             raise DeclarationError("OptionsEnv.reset takes one seed for all environments")
         self._seed = self._seed + 1 if seed is None else seed
@@ -86,9 +92,11 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self._memory = self._policy.start(self.num_envs)
         self._obs = self.engine.reset(self._seed)
         self._mask = self._hierarchy.mask(self._obs)
+        self._ready = True
         info = {} if self._mask is None else {"action_mask": self._mask}
         return unpack(self.single_observation_space, self._obs), info
 
+    @usual_floats()
     def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Run one call in each environment.
 
@@ -100,8 +108,12 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             Observations (N, *obs_shape); rewards, terminated, truncated (N,); ``info``, see above.
 
         Raises:
-            DeclarationError: an action is no skill, or the skill may not start there.
+            DeclarationError: an action is no skill, or the skill may not start there; or it has
+                not been reset, or is closed.
         """
+        if not self._ready:
+            instead = "it is closed; make another one" if self.closed else "call reset() first"
+            raise DeclarationError(f"OptionsEnv.step: {instead}")
         n = self.num_envs
         if self._hierarchy.goals:
             choice = self._hierarchy.fitted(self._choices(actions), self._obs, "OptionsEnv.step")
@@ -159,6 +171,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the engine; ``kwargs`` are not used."""
+        self._ready = False
         self.engine.close()
 
     def _masks(self, next_obs: Array, terminated: Array, truncated: Array) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from .core import Array, Memory, Policy, Step, Turn, World
 from .errors import DeclarationError, PolicyError
+from .floats import usual_floats
 from .infos import batched_infos
 from .spaces import Space, allows_each, at
 
@@ -53,18 +54,22 @@ class Actor:
         self._nan = nan
         leaves, size = deployed.sees.leaves, sum(deployed.acts.counts)
         self._real = [path for path, leaf in leaves.items() if leaf.record.kind == "f"]
+        self._choices = {path: leaf for path, leaf in leaves.items() if leaf.kind != "Box"}
+        """The parts of observations that are choices, which networks see one-hot."""
         part = leaves.get((MASK,)) if deployed.sees.kind == "Dict" else None
         self._observed_mask = part is not None and size > 0 and int(np.prod(part.shape)) == size
         """Observations have a part that is the mask of actions."""
         self._world = World(np.random.default_rng(seed))
         self.reset()
 
+    @usual_floats()
     def reset(self) -> None:
         """Start a new episode with an empty memory."""
         self.memory: Memory = self._deployed.policy.start(1)
         self._before: tuple[Array, Array] | None = None
         self._elapsed = 0
 
+    @usual_floats()
     def act(
         self,
         obs: Any,
@@ -122,11 +127,19 @@ class Actor:
             raise DeclarationError(
                 f"act() was given an observation that does not fit {space}: {error}"
             ) from error
+        for path, choices in self._choices.items():
+            part = at(seen, path)
+            low, high = choices.bounds
+            if ((part < low) | (part > high)).any():
+                raise DeclarationError(
+                    f"act() was given an observation in which {_named(path)} is "
+                    f"{str(part[0].tolist())[:100]}, which is not in {choices}"
+                )
         for path in self._real:
             part = at(seen, path)
             if not np.isnan(part).any():
                 continue
-            where = "obs" + "".join(f"[{name!r}]" for name in path)
+            where = _named(path)
             if self._nan == "error":
                 raise DeclarationError(
                     f"act() was given an observation with NaN in {where}: find out what the sensor "
@@ -163,3 +176,8 @@ class Actor:
             elapsed=np.array([self._elapsed]),
             info=batched_infos([dict(info)]),
         )
+
+
+def _named(path: tuple[str, ...]) -> str:
+    """Return the part of an observation with these names, as a user writes it."""
+    return "obs" + "".join(f"[{name!r}]" for name in path)

@@ -200,7 +200,14 @@ class Space:
                     f"{where} has shape {found.shape}, not {self.shape}"
                     + one * (found.shape[1:] == self.shape)
                 )
-            return found.astype(self.dtype, copy=False)
+            with np.errstate(invalid="ignore"):  # a NaN is no whole number, which is said below
+                numbers = found.astype(self.dtype, copy=False)
+            if self.record.kind != "f" and (changed := numbers != found).any():
+                raise PolicyError(
+                    f"{where} has the number {found[changed][0]}, which {self.dtype} of {self} "
+                    "cannot hold"
+                )
+            return numbers
         if isinstance(value, np.ndarray) and value.dtype == self.record:
             return value
         given, names = self.by_name(value), list(self.parts)

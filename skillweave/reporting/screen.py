@@ -14,21 +14,20 @@ from contextlib import contextmanager
 def without_screen() -> Iterator[None]:
     """Let environments draw without a screen on Linux, in this block or this function.
 
-    Set pygame to use no screen, and MuJoCo to draw with EGL where that is installed. The latter is
+    Set pygame to use no screen, and MuJoCo to draw with EGL where that is installed. Both are
     undone at the end, as the user may wish to draw with something else.
     """
     if sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         yield
         return
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    draws_with_egl = "MUJOCO_GL" not in os.environ and _has_egl()
-    if draws_with_egl:
-        os.environ["MUJOCO_GL"] = "egl"
+    added = {"SDL_VIDEODRIVER": "dummy"} | ({"MUJOCO_GL": "egl"} if _has_egl() else {})
+    added = {name: value for name, value in added.items() if name not in os.environ}
+    os.environ.update(added)
     try:
         yield
     finally:
-        if draws_with_egl:
-            os.environ.pop("MUJOCO_GL", None)
+        for name in added:
+            os.environ.pop(name, None)
 
 
 @functools.cache

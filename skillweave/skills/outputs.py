@@ -13,6 +13,7 @@ import numpy as np
 from skillweave._internal.messages import error_text, short, suggest
 from skillweave._internal.tracebacks import is_users
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
+from skillweave.policies.floats import by_program
 from skillweave.policies.infos import NUMBERS, Infos
 from skillweave.skills.probing import Call, look_at
 from skillweave.types import LARGEST_REWARD, Array, Step, read_only, wrong_reward
@@ -56,7 +57,7 @@ def called(
     call = Call(function, () if argument is None else (argument, *more), named or {}, fixed)
     look = look_at(call, judges) if looks else None
     try:
-        value = call()
+        value = by_program(call)
     except SkillweaveError:
         raise
     except (Exception, SystemExit) as error:

@@ -77,9 +77,27 @@ def obs_dtype(space: gym.Space[Any]) -> np.dtype[Any]:
     """Return the dtype of observations; a structured one for Dict and Tuple.
 
     Raises:
-        EnvError: the space is not supported; the message names supported ones, and what to do.
+        EnvError: the space is not supported; the message names supported ones, and what to do. Or
+            two of its parts have one name.
     """
-    return _dtype(space, space, ())
+    dtype = _dtype(space, space, ())
+    if dtype.names is not None:
+        _check_names(space)
+    return dtype
+
+
+def _check_names(space: gym.Space[Any]) -> None:
+    """Raise an EnvError where two parts have one name: ``a.b``, and ``b`` in ``a``."""
+    paths: dict[str, tuple[str, ...]] = {}
+    for path in leaf_spaces(space):
+        name = ".".join(path)
+        if name in paths:
+            both = " and ".join("".join(f"[{key!r}]" for key in p) for p in (paths[name], path))
+            raise EnvError(
+                f"two parts of space {short(space, 200)} are both called {name!r} ({both}): "
+                "let the environment call one of them otherwise"
+            )
+        paths[name] = path
 
 
 def _dtype(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...]) -> np.dtype[Any]:

@@ -1,5 +1,8 @@
 """A user's own pools: EnvPool's environments seen otherwise, for training."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import gymnasium as gym
@@ -272,3 +275,21 @@ def test_one_environment_of_envpool_plays_the_episodes_of_its_seed():
     first = env.reset(seed=3)[0]
     np.testing.assert_array_equal(env.reset(seed=3)[0], first)
     assert np.abs(env.reset(seed=4)[0] - first).max() > 0
+
+
+def test_importing_envpool_leaves_the_environment_and_matplotlib_as_they_were():
+    pytest.importorskip("envpool")
+    pytest.importorskip("matplotlib")
+    code = """
+import os, gymnasium, matplotlib
+before, backend = dict(os.environ), dict.__getitem__(matplotlib.rcParams, "backend")
+for name in [n for n in __import__("sys").modules if n.startswith("matplotlib")]:
+    del __import__("sys").modules[name]
+from skillweave.envs.pool import installed
+assert installed().list_all_envs()
+import matplotlib
+assert dict(os.environ) == before, os.environ.keys() ^ before.keys()
+assert type(dict.__getitem__(matplotlib.rcParams, "backend")) is type(backend)
+"""
+    env = {k: v for k, v in os.environ.items() if k not in ("MPLBACKEND", "MPLCONFIGDIR")}
+    subprocess.run([sys.executable, "-c", code], check=True, env=env)

@@ -1,0 +1,43 @@
+"""NumPy's handling of errors of floats: usual in the library, the program's own in its functions.
+
+A program may set ``numpy.seterr(all="raise")`` to find its own errors. In the library an underflow
+is a zero, as by default.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
+
+import numpy as np
+
+_PROGRAM: ContextVar[dict[str, Any] | None] = ContextVar("_PROGRAM", default=None)
+"""What the program has set, while the library computes otherwise; None: it has set nothing."""
+
+
+@contextmanager
+def usual_floats() -> Iterator[None]:
+    """Handle errors of floats as NumPy does by default, or ignore what the program ignores."""
+    now: dict[str, Any] = dict(np.geterr())
+    usual: dict[str, Any] = {kind: "ignore" if now[kind] == "ignore" else "warn" for kind in now}
+    usual["under"] = "ignore"
+    if usual == now:
+        yield
+        return
+    before = _PROGRAM.set(now)
+    try:
+        with np.errstate(**usual):
+            yield
+    finally:
+        _PROGRAM.reset(before)
+
+
+def by_program(function: Callable[..., Any], *args: Any, **named: Any) -> Any:
+    """Return the result of a function of the program, with the handling that it has set."""
+    program = _PROGRAM.get()
+    if program is None:
+        return function(*args, **named)
+    with np.errstate(**program):
+        return function(*args, **named)
