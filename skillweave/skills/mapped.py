@@ -23,20 +23,14 @@ from skillweave.policies.mapped import Function, Input, Mapped, Model, numbers_o
 from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.policies.spaces import Space as Data
 from skillweave.skills.foreign_policy import EXAMPLES, SEES, Foreign, made_up
+from skillweave.skills.function_state import State, examples
 from skillweave.skills.goal_spaces import with_goal, without_goal
 from skillweave.skills.goals import Goals
 from skillweave.skills.mapping import LastAction, PolicyMapping
 from skillweave.skills.outputs import Wrapped, of_numbers
 from skillweave.skills.plan import described, fitted_inputs, fitted_outputs, for_model
-from skillweave.skills.probing import (
-    MOST_BYTES,
-    State,
-    examples,
-    largest_difference,
-    other_rows,
-    parts_of,
-    shown,
-)
+from skillweave.skills.probing import MOST_BYTES
+from skillweave.skills.rows import largest_difference, other_rows, parts_of, shown
 from skillweave.types import Array, Memoryless
 
 
@@ -269,9 +263,9 @@ def look_at_outputs(policy: MappedPolicy) -> None:
                 raise PolicyError(hidden)
         if differs:
             raise PolicyError(
-                f"{who} answers {shown(differs[0])} for an observation, but {shown(differs[1])} for "
-                "the same one beside other observations, so an environment's action depends on the "
-                "other environments: let the model use no statistics over the batch (mean(0), "
+                f"{who} answers {shown(differs[0])} for an observation, but {shown(differs[1])} "
+                "for the same one beside other observations, so an environment's action depends on "
+                "the other environments: let the model use no statistics over the batch (mean(0), "
                 "batch normalization in training mode)"
             )
     _note_probabilities(policy, first)
@@ -307,8 +301,8 @@ def _note_probabilities(policy: MappedPolicy, outputs: dict[str, Array]) -> None
     sums = [part.sum(-1) for part in np.split(output, ends, axis=-1)]
     if np.allclose(sums, 1.0, atol=1e-3):
         acting.on_sample = (
-            f"{policy._who} returns numbers that are at least 0 and sum to 1, so probabilities, but "
-            "is sampled as if they were logits: leave out the network's last Softmax, or use "
+            f"{policy._who} returns numbers that are at least 0 and sum to 1, so probabilities, "
+            "but is sampled as if they were logits: leave out the network's last Softmax, or use "
             "LogSoftmax"
         )
 
