@@ -34,6 +34,10 @@ from skillweave.skills.rows import largest_difference, other_rows, parts_of, sho
 from skillweave.types import Array, Memoryless
 
 
+ROUNDING = 0.03
+"""The largest difference of outputs, relative to their size, that is rounding: that of 8 bits."""
+
+
 class MappedPolicy(Functional, Foreign, Model):
     """A policy from elsewhere behind a mapping; a subclass makes its model."""
 
@@ -243,7 +247,9 @@ def look_at_outputs(policy: MappedPolicy) -> None:
         hidden = f"{who} {hidden_state(written)}"
         if largest_difference(first, twin.outputs(obs), every):
             state.prepare()
-            if written or (policy.kind == "torch" and not state_of_chance(policy, first, obs)):
+            # With the same random numbers, only a state makes the module of the twin differ again.
+            runs_on = policy.kind == "torch" and largest_difference(first, twin.outputs(obs), every)
+            if written or runs_on:
                 raise PolicyError(hidden)
             if all(x.dtype.kind == "f" for x in first.values()):
                 notice(
@@ -256,9 +262,9 @@ def look_at_outputs(policy: MappedPolicy) -> None:
         sizes = {len(obs), *(n for x in (obs, *first.values()) for n in x.shape[1:])}
         rows = other_rows(first, len(obs), sizes, len(obs), 0)
         other = twin.outputs(obs[rows])
-        differs = largest_difference(first, other, rows, 1e-2)
+        differs = largest_difference(first, other, rows, ROUNDING)
         if written:
-            fresh = largest_difference(first, policy.twin().outputs(obs[rows]), rows, 1e-2)
+            fresh = largest_difference(first, policy.twin().outputs(obs[rows]), rows, ROUNDING)
             if (fresh is None) != (differs is None):
                 raise PolicyError(hidden)
         if differs:
@@ -274,17 +280,11 @@ def look_at_outputs(policy: MappedPolicy) -> None:
 def hidden_state(written: Sequence[str]) -> str:
     """Return a clause about the tensors that a module writes, and by which it answers."""
     return (
-        f"keeps a hidden state, {', '.join(map(repr, written[:3])) or 'a tensor'}, which would run "
+        f"keeps a hidden state, {', '.join(map(repr, written[:3])) or 'an attribute'}, which would run "
         "on from one episode into the next, and which all environments would share: let "
         "forward(obs, state) return the output and the next state, and give the shape of the "
         "state, from_torch(module, state=(None, 64))"
     )
-
-
-def state_of_chance(policy: MappedPolicy, first: dict[str, Array], obs: Array) -> bool:
-    """Return whether the outputs come again with the same random numbers."""
-    again = policy.twin().outputs(obs)
-    return largest_difference(first, again, np.arange(len(obs))) is None
 
 
 def _note_probabilities(policy: MappedPolicy, outputs: dict[str, Array]) -> None:
