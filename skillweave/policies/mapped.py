@@ -858,8 +858,8 @@ class Mapped(Policy):
         row = forbidden[0]
         return (
             f"{self.who} chose the action {action[row].tolist()}, which the environment's action "
-            f"mask forbids, in {len(forbidden)} of {len(action)} environments of one step: a policy "
-            "that chooses by itself must know what is allowed. Let it see the mask in the "
+            f"mask forbids, in {len(forbidden)} of {len(action)} environments of one step: a "
+            "policy that chooses by itself must know what is allowed. Let it see the mask in the "
             "observation, return logits, which are masked, or start only where its action is "
             "allowed (initiation)"
         )

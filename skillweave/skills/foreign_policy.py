@@ -16,8 +16,10 @@ from skillweave._internal.tracebacks import is_own_code
 from skillweave.errors import PolicyError, RunError, SkillweaveError
 from skillweave.policies.files import checksum
 from skillweave.policies.spaces import at, space_of
+from skillweave.skills.function_state import examples
 from skillweave.skills.goal_spaces import draw_from
-from skillweave.skills.probing import Call, examples, look_at
+from skillweave.skills.probing import look_at
+from skillweave.skills.rows import Call
 from skillweave.types import Array, Memoryless, Policy
 
 EXAMPLES = 16

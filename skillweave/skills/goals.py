@@ -19,9 +19,9 @@ from skillweave.policies.hierarchy import TRIES, CallGoals
 from skillweave.policies.parts import joined
 from skillweave.policies.spaces import space_of
 from skillweave.skills.base import Skill, path_of
+from skillweave.skills.function_state import untouched
 from skillweave.skills.goal_spaces import alone
 from skillweave.skills.outputs import called
-from skillweave.skills.probing import untouched
 from skillweave.types import Array, Step, read_only
 
 

@@ -23,21 +23,19 @@ from skillweave.policies.mapped import Function, Input, Mapped, Model, numbers_o
 from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.policies.spaces import Space as Data
 from skillweave.skills.foreign_policy import EXAMPLES, SEES, Foreign, made_up
+from skillweave.skills.function_state import State, examples
 from skillweave.skills.goal_spaces import with_goal, without_goal
 from skillweave.skills.goals import Goals
 from skillweave.skills.mapping import LastAction, PolicyMapping
 from skillweave.skills.outputs import Wrapped, of_numbers
 from skillweave.skills.plan import described, fitted_inputs, fitted_outputs, for_model
-from skillweave.skills.probing import (
-    MOST_BYTES,
-    State,
-    examples,
-    largest_difference,
-    other_rows,
-    parts_of,
-    shown,
-)
+from skillweave.skills.probing import MOST_BYTES
+from skillweave.skills.rows import largest_difference, other_rows, parts_of, shown
 from skillweave.types import Array, Memoryless
+
+
+ROUNDING = 0.03
+"""The largest difference of outputs, relative to their size, that is rounding: that of 8 bits."""
 
 
 class MappedPolicy(Functional, Foreign, Model):
@@ -249,7 +247,9 @@ def look_at_outputs(policy: MappedPolicy) -> None:
         hidden = f"{who} {hidden_state(written)}"
         if largest_difference(first, twin.outputs(obs), every):
             state.prepare()
-            if written or (policy.kind == "torch" and not state_of_chance(policy, first, obs)):
+            # With the same random numbers, only a state makes the module of the twin differ again.
+            runs_on = policy.kind == "torch" and largest_difference(first, twin.outputs(obs), every)
+            if written or runs_on:
                 raise PolicyError(hidden)
             if all(x.dtype.kind == "f" for x in first.values()):
                 notice(
@@ -262,16 +262,16 @@ def look_at_outputs(policy: MappedPolicy) -> None:
         sizes = {len(obs), *(n for x in (obs, *first.values()) for n in x.shape[1:])}
         rows = other_rows(first, len(obs), sizes, len(obs), 0)
         other = twin.outputs(obs[rows])
-        differs = largest_difference(first, other, rows, 1e-2)
+        differs = largest_difference(first, other, rows, ROUNDING)
         if written:
-            fresh = largest_difference(first, policy.twin().outputs(obs[rows]), rows, 1e-2)
+            fresh = largest_difference(first, policy.twin().outputs(obs[rows]), rows, ROUNDING)
             if (fresh is None) != (differs is None):
                 raise PolicyError(hidden)
         if differs:
             raise PolicyError(
-                f"{who} answers {shown(differs[0])} for an observation, but {shown(differs[1])} for "
-                "the same one beside other observations, so an environment's action depends on the "
-                "other environments: let the model use no statistics over the batch (mean(0), "
+                f"{who} answers {shown(differs[0])} for an observation, but {shown(differs[1])} "
+                "for the same one beside other observations, so an environment's action depends on "
+                "the other environments: let the model use no statistics over the batch (mean(0), "
                 "batch normalization in training mode)"
             )
     _note_probabilities(policy, first)
@@ -280,17 +280,11 @@ def look_at_outputs(policy: MappedPolicy) -> None:
 def hidden_state(written: Sequence[str]) -> str:
     """Return a clause about the tensors that a module writes, and by which it answers."""
     return (
-        f"keeps a hidden state, {', '.join(map(repr, written[:3])) or 'a tensor'}, which would run "
+        f"keeps a hidden state, {', '.join(map(repr, written[:3])) or 'an attribute'}, which would run "
         "on from one episode into the next, and which all environments would share: let "
         "forward(obs, state) return the output and the next state, and give the shape of the "
         "state, from_torch(module, state=(None, 64))"
     )
-
-
-def state_of_chance(policy: MappedPolicy, first: dict[str, Array], obs: Array) -> bool:
-    """Return whether the outputs come again with the same random numbers."""
-    again = policy.twin().outputs(obs)
-    return largest_difference(first, again, np.arange(len(obs))) is None
 
 
 def _note_probabilities(policy: MappedPolicy, outputs: dict[str, Array]) -> None:
@@ -307,8 +301,8 @@ def _note_probabilities(policy: MappedPolicy, outputs: dict[str, Array]) -> None
     sums = [part.sum(-1) for part in np.split(output, ends, axis=-1)]
     if np.allclose(sums, 1.0, atol=1e-3):
         acting.on_sample = (
-            f"{policy._who} returns numbers that are at least 0 and sum to 1, so probabilities, but "
-            "is sampled as if they were logits: leave out the network's last Softmax, or use "
+            f"{policy._who} returns numbers that are at least 0 and sum to 1, so probabilities, "
+            "but is sampled as if they were logits: leave out the network's last Softmax, or use "
             "LogSoftmax"
         )
 

@@ -15,7 +15,8 @@ from skillweave._internal.tracebacks import is_users
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
 from skillweave.policies.floats import by_program
 from skillweave.policies.infos import NUMBERS, Infos
-from skillweave.skills.probing import Call, look_at
+from skillweave.skills.probing import look_at
+from skillweave.skills.rows import Call
 from skillweave.types import LARGEST_REWARD, Array, Step, read_only, wrong_reward
 
 OF_DICTS = ("no field of name", "dtype([", "VoidDType", "numpy.void")

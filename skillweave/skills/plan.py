@@ -23,9 +23,9 @@ from skillweave.policies.mapped import (
 )
 from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import made_up
+from skillweave.skills.function_state import examples
 from skillweave.skills.mapping import Acts, Goal, LastAction, Part, PolicyMapping, Source
 from skillweave.skills.outputs import of_numbers
-from skillweave.skills.probing import examples
 from skillweave.types import Array
 
 # Inputs

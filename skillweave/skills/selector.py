@@ -31,9 +31,9 @@ from skillweave.policies.selectors import (
 )
 from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import Foreign, made_up, qualified
+from skillweave.skills.function_state import examples
 from skillweave.skills.goal_spaces import alone
 from skillweave.skills.outputs import Wrapped, answer, called, required_arguments
-from skillweave.skills.probing import examples
 from skillweave.skills.tree import Composite, Condition, Node, Sequence
 from skillweave.types import Array
 

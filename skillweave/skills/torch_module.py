@@ -103,13 +103,15 @@ class TorchPolicy(MappedPolicy):
         return {name: x.detach().cpu().numpy().copy() for name, x in found.items()}
 
     def _failure(self, error: BaseException) -> PolicyError:
-        """Return the error of a call that failed, also where it writes a state of one environment."""
+        """Return the error of a call that failed, or that a state of one environment is kept."""
         twin, before = self.twin(), self.tensors()
         twin._failure = super()._failure  # type: ignore[method-assign]
         with suppress(Exception):
             twin.outputs(made_up(self.observation_space, 1))
         after = twin.tensors()
-        if written := [k for k, x in after.items() if not np.array_equal(x, before.get(k))]:
+        if written := [
+            k for k, x in after.items() if k not in before or not np.array_equal(x, before[k])
+        ]:
             return PolicyError(f"{self._who} {hidden_state(written)}")
         return super()._failure(error)
 

@@ -333,8 +333,9 @@ def evaluate(
 
     Raises:
         PolicyError: the policy was made for other spaces.
-        DeclarationError: the policy cannot act; the engine does not exist; or calls are to be logged, of a policy without
-            skills, of a skill that acts alone, or more than 4 GiB of them.
+        DeclarationError: the policy cannot act; the engine does not exist; or calls are to be
+            logged, of a policy without skills, of a skill that acts alone, or more than 4 GiB of
+            them.
         EnvError: the environment cannot be made, or not in a pool, or sets no such key of ``info``.
     """
     policy = as_policy(policy, "evaluate(): policy")

@@ -26,6 +26,9 @@ from skillweave.skills import Skill
 from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Array
 
+# Functions of the worlds choose at random, also what a mask forbids.
+pytestmark = pytest.mark.filterwarnings("ignore:.*action mask forbids")
+
 
 @lru_cache(64)
 def expected(number: int, seed: int, learns: str) -> list[Moment]:

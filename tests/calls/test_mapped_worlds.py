@@ -18,6 +18,8 @@ from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.spaces import obs_dtype
 from skillweave.types import Array
 
+# Functions of the worlds choose at random, also what a mask forbids.
+pytestmark = pytest.mark.filterwarnings("ignore:.*action mask forbids")
 HOOK = sw.Part("hook", scale=2.0, offset=0.5, clip=(-1, 1))
 GOAL = (0.25, -0.5)
 STATES: dict[str, Any] = {

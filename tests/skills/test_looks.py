@@ -199,6 +199,11 @@ def largest(net: Any, x: Any) -> Any:
     return x - net.most
 
 
+def counts(net: Any, x: Any) -> Any:
+    net.calls = getattr(net, "calls", 0) + 1
+    return x * net.calls
+
+
 def caches(net: Any, x: Any) -> Any:
     net.features = x.detach()
     return x
@@ -209,6 +214,7 @@ MODELS: dict[str, tuple[Callable[[Any, Any], Any], str]] = {
     "largest": (lambda net, x: x / x.abs().max(), "the same one beside other observations"),
     "best action": (lambda net, x: (x - x.mean(0)).argmax(1), "beside other observations"),
     "state": (keeps, "a hidden state, 'h', which .*state="),
+    "counter": (counts, "keeps a hidden state, an attribute"),
     "running maximum": (largest, "a hidden state, 'most'"),
     "buffer of one": (
         lambda net, x: net.layer.bias.data.mul_(0) + net.h.add_(x),
