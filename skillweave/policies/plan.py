@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -29,6 +29,13 @@ FURTHER = 2.0
 """A neighbor counts only if it is at most so many times as far as the nearest, or as is usual:
 where the log has few calls, others are often behind a wall, and a small chance to pass it would
 grow with each call that is tried again."""
+POOL = 128
+"""The nearest calls of a skill with goals by start, of which some give their goals to the options,
+and by which these are judged."""
+POOL_AHEAD = 4
+"""As ``AHEAD``, of a pool: the pool may be of somewhat fewer calls."""
+JUDGES = 15
+"""The fewest calls that judge a goal: by fewer, the best of many goals would be the luckiest."""
 MOST_OPTIONS = 10_000
 MOST_COUNTERS = 4
 
@@ -159,34 +166,41 @@ class OptionGroup:
             Pieces (n, options, k), distances (n, options, k), infinite where there are fewer; and
             the calls whose goals the options have, (n, options), −1: none.
         """
-        n, many = len(to), k if self.options == 1 else self.options
+        n = len(to)
         pieces = np.zeros((n, self.options, k), np.int64)
         far = np.full(pieces.shape, np.inf, np.float32)
         if not len(self.rows):
             return pieces, far, np.full(far.shape[:2], -1)
-        near, off = self._nearest(to, many, without)
-        goal = np.where(np.isfinite(off), self.goal[near], -1)[:, : self.options]
+        near, off = self._nearest(to, k if self.options == 1 else POOL, without)
         if self.options == 1:
             pieces[:, 0], far[:, 0] = self.rows[near], off
-            return pieces, far, goal
+            return pieces, far, np.where(np.isfinite(off), self.goal[near], -1)[:, :1]
         assert aims is not None
-        for some in _blocks(n, many**2):
-            goals = aims[self.call[near[some]]]
-            apart = np.square(goals[:, :, None] - goals[:, None]).sum(3)
-            both = np.sqrt(off[some, None] ** 2 + apart)  # (n, options, calls)
-            least = np.argsort(both, axis=2, kind="stable")[:, :, :k]
-            most = least.shape[2]
-            far[some, :, :most] = np.take_along_axis(both, least, 2)
-            own = np.take_along_axis(near[some, None].repeat(many, 1), least, 2)
-            pieces[some, :, :most] = self.rows[own]
-        far[~np.isfinite(off)] = np.inf
+        # Of every so-many-th call by start the goal is an option; all judge it but its own call.
+        each = np.arange(self.options)
+        known = np.isfinite(off).sum(1, keepdims=True)
+        own = each * np.maximum(known, self.options) // self.options
+        goal = np.where(own < known, np.take_along_axis(self.goal[near], own, 1), -1)
+        for some in _blocks(n, self.options * POOL):
+            goals, mine = aims[self.call[near[some]]], own[some, :, None]
+            apart = np.square(np.take_along_axis(goals, mine, 1)[:, :, None] - goals[:, None]).sum(3)
+            apart += np.square(off[some, None])  # (n, options, calls)
+            np.put_along_axis(apart, mine, np.inf, 2)
+            least = apart.argpartition(k - 1, axis=2)[:, :, :k]
+            both = np.take_along_axis(apart, least, 2)
+            order = both.argsort(axis=2, kind="stable")
+            far[some] = np.sqrt(np.take_along_axis(both, order, 2))
+            judges = np.take_along_axis(least, order, 2)
+            pieces[some] = self.rows[np.take_along_axis(near[some, None], judges, 2)]
+        far[goal < 0] = np.inf
         return pieces, far, goal
 
     def _nearest(self, to: Array, count: int, without: Array | None) -> tuple[Array, Array]:
         """Return the places of the nearest pieces, (n, count), and distances (n, count)."""
+        ahead = AHEAD if self.options == 1 else POOL_AHEAD
         if without is None:
-            return nearest(self.starts, to, count, self.call, self._squares)
-        near, far = nearest(self.starts, to, count + 1, self.call, self._squares)
+            return nearest(self.starts, to, count, self.call, self._squares, ahead)
+        near, far = nearest(self.starts, to, count + 1, self.call, self._squares, ahead)
         far[self.call[near] == without[:, None]] = np.inf
         order = np.argsort(far, axis=1, kind="stable")[:, :count]
         return np.take_along_axis(near, order, 1), np.take_along_axis(far, order, 1)
@@ -208,6 +222,9 @@ class Options:
         each = max(1, len(self.lengths))
         self.choices = len(self.aims) * each
         of = [group.choice for group in self.groups]
+        several = any(group.options > 1 for group in self.groups)
+        self.judges = max(self.neighbors, JUDGES) if several else self.neighbors
+        """The most calls that judge an option."""
         rising = list(self.lengths) == sorted(set(self.lengths))
         whole = of and of == sorted(of) and {*of} == {*range(self.choices)}
         if not whole or not rising or self.neighbors < 1:
@@ -241,6 +258,15 @@ class Options:
             for name in ("goal", "call"):
                 check(name, getattr(group, name), "iu", (None,), 0, len(own))
 
+    def of_calls(self, some: Array) -> Options:
+        """Return the same options, judged by some calls alone; ``some``: (C,) bool."""
+        groups = []
+        for group in self.groups:
+            at = some[group.call]
+            columns = {k: getattr(group, k)[at] for k in ("rows", "starts", "call", "goal")}
+            groups.append(replace(group, **columns))
+        return replace(self, groups=tuple(groups))
+
     def near(self, features: Sequence[Array], most: int = 0, without: Array | None = None) -> Near:
         """Return the nearest pieces of each option to features of each skill, (n, F) each.
 
@@ -252,7 +278,9 @@ class Options:
         for group in self.groups:
             skill = self.skill_of[group.choice]
             to, aims = features[skill], self.aims[skill]
-            pieces, far, goal = group.near(to, most or self.neighbors, aims, without)
+            pieces, far, goal = group.near(to, most or self.judges, aims, without)
+            if group.options == 1 and not most:
+                far[..., self.neighbors :] = np.inf
             limit = FURTHER * np.maximum(far[..., :1], np.float32(group.usual))
             found.append((pieces, np.where(far <= limit, far, np.float32(np.inf)), goal))
         pieces, distance, goal = (np.concatenate(part, 1) for part in zip(*found, strict=True))
@@ -274,7 +302,12 @@ class Options:
 
 
 def nearest(
-    points: Array, to: Array, count: int, group: Array, squares: Array | None = None
+    points: Array,
+    to: Array,
+    count: int,
+    group: Array,
+    squares: Array | None = None,
+    ahead: int = AHEAD,
 ) -> tuple[Array, Array]:
     """Return the ``count`` nearest points to each row of ``to``, each of another group.
 
@@ -284,12 +317,13 @@ def nearest(
         count: how many.
         group: (m,) the group of each point; of a group only the nearest point counts.
         squares: (m,) of the points' lengths, if they are known.
+        ahead: points that are looked at for each of ``count``.
 
     Returns:
         Their rows (n, count) int64, the nearest first, of equally near ones the first; and
         distances (n, count) float32. Where there are fewer groups, the distance is infinite.
     """
-    tries = min(len(points), count * AHEAD)
+    tries = min(len(points), count * ahead)
     if tries == len(points):
         near = np.broadcast_to(np.arange(tries), (len(to), tries))
     else:
