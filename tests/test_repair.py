@@ -323,7 +323,7 @@ def test_a_pair_that_is_seldom_called_is_given_up(run, tmp_path, monkeypatch):
 def matrix(*rows: tuple[float, float]) -> Handover:
     """Rates of the skills a and b after start, a and b, from 100 calls each."""
     done = np.rint(100 * np.array(rows)).astype(np.int64)
-    return Handover(("a", "b"), np.full((3, 2), 100), done, np.zeros(2, np.int64))
+    return Handover(("a", "b"), np.full((3, 2), 100), done, np.zeros((3, 2), np.int64))
 
 
 @pytest.mark.parametrize(

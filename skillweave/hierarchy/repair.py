@@ -254,10 +254,10 @@ def measure(
         may_start |= bool(may.any())
         of_skill = log.skill == number
         won = calls_done(log, done)
-        whole = (log.skill == first) & ~log.was_cut
+        whole = (log.skill == first) & ~log.began_late
         tried, succeeded = tried + int(whole.sum()), succeeded + int((whole & won).sum())
         for was_done, each in rates.items():
-            some = of_skill & (won == was_done) & ~log.was_cut
+            some = of_skill & (won == was_done) & ~log.began_late
             each.extend((returns[some] / log.tau[some]).tolist())
         following = log.followed_by
         first_calls = np.flatnonzero(following >= 0)
@@ -281,8 +281,12 @@ def measure(
 
 
 def _sum(one: Handover, other: Handover) -> Handover:
-    counts = {k: getattr(one, k) + getattr(other, k) for k in ("calls", "done", "cut")}
-    return replace(one, **counts)
+    added = ("calls", "done", "began_late", "steps")
+    counts = {k: getattr(one, k) + getattr(other, k) for k in added}
+    limit = max(one.time_limit, other.time_limit)
+    assert one.needed is not None
+    assert other.needed is not None
+    return replace(one, **counts, time_limit=limit, needed=np.maximum(one.needed, other.needed))
 
 
 def rehearsed_obs(
@@ -320,14 +324,19 @@ def rehearsed_obs(
 
 def matrix_to_json(matrix: Handover) -> Matrix:
     """Return a matrix as a run records it."""
-    calls, done, cut = (x.tolist() for x in (matrix.calls, matrix.done, matrix.cut))
-    return Matrix(list(matrix.skills), calls, done, cut, list(matrix.by_itself))
+    calls, done, late = (x.tolist() for x in (matrix.calls, matrix.done, matrix.began_late))
+    needed = None if matrix.needed is None else matrix.needed.tolist()
+    by_itself, limit = list(matrix.by_itself), matrix.time_limit
+    return Matrix(list(matrix.skills), calls, done, late, by_itself, limit, needed)
 
 
 def matrix_from_json(entry: Matrix) -> Handover:
     """Return the matrix of ``matrix_to_json``."""
-    calls, done, cut = (np.array(x, np.int64) for x in (entry.calls, entry.done, entry.cut))
-    return Handover(tuple(entry.skills), calls, done, cut, tuple(entry.by_itself))
+    columns = (entry.calls, entry.done, entry.began_late)
+    calls, done, late = (np.array(x, np.int64) for x in columns)
+    needed = None if entry.needed is None else np.array(entry.needed, np.int64)
+    by_itself, limit = tuple(entry.by_itself), entry.time_limit
+    return Handover(tuple(entry.skills), calls, done, late, by_itself, limit, needed)
 
 
 def judge_repair(

@@ -38,7 +38,7 @@ from skillweave.types import LARGEST_REWARD, Array
 
 PER_SKILL = ("checksums", "sees", "recurrent", "own_success")
 """Fields with a value for each skill."""
-PLAIN = ("skills", "lengths", *PER_SKILL, "code")
+PLAIN = ("skills", "lengths", *PER_SKILL, "code", "limits")
 """Fields that the header has as they are."""
 RANGES: dict[str, tuple[float, float]] = {
     "end_reason": (1, max(CallEnd)),
@@ -77,6 +77,7 @@ class CallsHeader:
     goals: tuple[str, ...]
     """The skills that have goals."""
     code: Texts
+    limits: tuple[AtLeastOne | None, ...] = ()
     run: LoggedRun | None = None
 
 
@@ -135,6 +136,8 @@ def _check(header: CallsHeader, places: int) -> None:
         raise ValueError("its lengths do not rise")
     if any(len(getattr(header, name)) != len(skills) for name in PER_SKILL):
         raise ValueError("its header does not have an entry for each skill")
+    if header.limits and len(header.limits) != len(skills):
+        raise ValueError("its header does not have a limit for each skill")
     if any(place >= places for seen in header.sees for place in seen or ()):
         raise ValueError(f"'sees' has places beyond the {places} of an observation")
     if not set(header.goals) <= set(skills):

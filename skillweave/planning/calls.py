@@ -65,6 +65,8 @@ class CallLog(LinkedCalls):
         goals: by skill that has goals, (C, G) float64, the numbers of its calls' goals; in rows of
             other skills they mean nothing.
         code: texts of the environment and the skills, to be compared later.
+        limits: of each skill, the most steps of a call; None: it has no limit. (): unknown.
+        known_time_limit: ``time_limit`` of the log that these calls were taken from; None: of none.
     """
 
     def check_skills(self, skills: SkillSet, *, learning: bool = False) -> None:
@@ -173,6 +175,11 @@ def join(logs: Iterable[CallLog]) -> CallLog:
                 "of one log the skills' success() was known, of another not (its run was loaded "
                 "without their code); record both with it"
             )
+        if log.limits and first.limits and log.limits != first.limits:
+            raise RunError(
+                "the limits of calls (call_steps, max_steps) differ between the logs; join logs of "
+                "the same skills"
+            )
         if {k: v.shape[1:] for k, v in log.goals.items()} != {
             k: v.shape[1:] for k, v in first.goals.items()
         }:
@@ -190,7 +197,11 @@ def join(logs: Iterable[CallLog]) -> CallLog:
     columns = {name: np.concatenate([of[name] for of in every]) for name in every[0]}
     columns["episode"] = np.concatenate(episodes)
     columns["offset"] = np.cumsum(np.concatenate([[0], *(log.tau for log in logs)]))
-    return replace(first, **fields_of(columns))
+    limit = max(log.time_limit for log in logs)
+    longer = any((log.age + log.tau).max(initial=0) > limit for log in logs)
+    limits = next((log.limits for log in logs if log.limits), ())
+    known = 0 if longer else limit
+    return replace(first, **fields_of(columns), limits=limits, known_time_limit=known)
 
 
 def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ Stands apart from ``CallLog``, so that what reads columns can be a method there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -89,6 +89,8 @@ class CallColumns(Choices):
     info: dict[str, Array] = field(default_factory=dict)
     goals: dict[str, Array] = field(default_factory=dict)
     code: Texts = field(default_factory=dict)
+    limits: tuple[int | None, ...] = ()
+    known_time_limit: int | None = None
 
     def __len__(self) -> int:
         return len(self.choice)
@@ -143,6 +145,29 @@ class CallColumns(Choices):
         """(C,) bool: the episode's time limit cut the call."""
         cut: Array = self.truncated & ~self.terminated & (self.end_reason == CallEnd.EPISODE)
         return cut
+
+    @cached_property
+    def time_limit(self) -> int:
+        """The steps after which a time limit ends episodes; 0: none is seen.
+
+        It is the age of the oldest step, if an episode was truncated there. An episode that was
+        truncated at another age was so for another reason.
+        """
+        if self.known_time_limit is not None:
+            return self.known_time_limit
+        return time_limit_of(self.age + self.tau, self.truncated & ~self.terminated)
+
+    @cached_property
+    def whole_steps(self) -> Array:
+        """The steps of a whole call of each choice, (choices,) int64; see ``whole_steps``."""
+        limits = limits_of_choices(self, self.limits or (None,) * len(self.skills))
+        complete = (self.end_reason == CallEnd.OWN) | self.terminated
+        return whole_steps(self.choice, self.tau, complete, self.was_cut, limits)
+
+    @cached_property
+    def began_late(self) -> Array:
+        """(C,) bool: the call began too late to run its whole length, so it counts nowhere."""
+        return began_late(self.age, self.whole_steps[self.choice], self.time_limit)
 
     @cached_property
     def followed_by(self) -> Array:
@@ -215,7 +240,8 @@ class CallColumns(Choices):
         steps = np.arange(offset[-1]) + np.repeat(self.offset[rows] - offset[:-1], tau)
         per_step = (*PER_STEP, *(INFO + key for key in self.info))
         columns = {k: x[steps if k in per_step else rows] for k, x in columns_of(self).items()}
-        return replace(self, **fields_of(columns) | {"offset": offset})
+        part = replace(self, **fields_of(columns) | {"offset": offset})
+        return replace(part, known_time_limit=self.time_limit)
 
     def within(self, steps: int) -> Self:
         """Return the first calls, as many as have at most ``steps`` steps in all."""
@@ -224,6 +250,68 @@ class CallColumns(Choices):
     def latest(self, steps: int) -> Self:
         """Return the last calls, as many as have at most ``steps`` steps in all."""
         return self.take(np.flatnonzero(self.steps - self.offset[:-1] <= steps))
+
+
+def time_limit_of(age_after: Array, truncated: Array) -> int:
+    """Return the steps after which a time limit ends episodes; 0: none is seen.
+
+    Args:
+        age_after: (C,) the steps of the episode until the end of each call.
+        truncated: (C,) bool, the episode was truncated, and not terminated, at the call's end.
+    """
+    limit = int(age_after[truncated].max(initial=0))
+    return limit if age_after.max(initial=0) <= limit else 0
+
+
+def limits_of_choices(choices: Choices, limits: Sequence[int | None]) -> Array:
+    """Return the most steps of a call of each choice, (choices,) int64; 0: it has no limit.
+
+    Args:
+        choices: skills, perhaps with lengths.
+        limits: of each skill; None: it has none.
+    """
+    of_skill = [limits[choices.skill_of(choice)] for choice in range(choices.choices)]
+    lengths = (choices.lengths or (None,)) * len(choices.skills)
+    both = zip(of_skill, lengths, strict=True)
+    return np.array([min((x for x in pair if x is not None), default=0) for pair in both], np.int64)
+
+
+def whole_steps(
+    choice: Array, steps: Array, complete: Array, was_cut: Array, limits: Array
+) -> Array:
+    """Return the steps of a whole call of each choice, (choices,) int64.
+
+    They are its limit. Without one, they are those of the longest call that came to its own end, or
+    of the longest of all where none did; and 0 where no call was cut, as nothing is unknown then.
+
+    Args:
+        choice: (C,) of each call.
+        steps: (C,) of each call.
+        complete: (C,) bool, the call ended by itself, or the episode terminated.
+        was_cut: (C,) bool, the episode's time limit cut the call.
+        limits: see ``limits_of_choices``.
+    """
+    longest, longest_complete = (np.zeros(len(limits), np.int64) for _ in range(2))
+    np.maximum.at(longest, choice, steps)
+    np.maximum.at(longest_complete, choice[complete], steps[complete])
+    unlimited = np.where(longest_complete > 0, longest_complete, longest)
+    unlimited[np.bincount(choice[was_cut], minlength=len(limits)) == 0] = 0
+    return np.where(limits > 0, limits, unlimited)
+
+
+def began_late(age: Array, whole: Array, time_limit: int) -> Array:
+    """Return the calls that began too late to run their whole length, (C,) bool.
+
+    These count nowhere, whatever their end and outcome: else those that are over soon would count
+    more than others. A call that began with its episode was never too late.
+
+    Args:
+        age: (C,) the steps of the episode before each call.
+        whole: (C,) the steps of a whole call.
+        time_limit: of ``time_limit_of``.
+    """
+    late: Array = (age > 0) & (age + whole > time_limit) & (time_limit > 0)
+    return late
 
 
 def columns_of(log: CallColumns) -> dict[str, Array]:

@@ -107,7 +107,7 @@ def _help(
     log: CallColumns, skill: int, start: Array, end: Array, rest: list[int], more: list[int]
 ) -> bool:
     """Return whether ``more`` numbers beside ``rest`` help to predict where a skill's calls end."""
-    rows = np.flatnonzero((log.skill == skill) & ~log.was_cut)  # a time limit cuts anywhere
+    rows = np.flatnonzero((log.skill == skill) & ~log.began_late)  # a time limit cuts anywhere
     if len(rows) < FEWEST:
         return True
     rows = evenly(rows, MOST)

@@ -1,49 +1,50 @@
 """Forecasts of plans: episodes that follow a plan along logged calls, before it is played.
 
-A plan chooses the calls that went best, so these calls say too much good of it. Forecasts judge a
-plan by calls that it has not seen: episodes of the log are split into folds, the task is solved
-without one, and the plan is followed along the calls of that one (cross-fitting).
+A plan without goals chooses among few skills, and follows any logged calls. One with goals chooses
+among many goals, and the best of them is often the luckiest: its own calls say too much good of it.
+So episodes of the log are split into halves; the goal is chosen by one, and the calls of the other
+are followed. Half a log chooses worse than the whole one, so both chances, the one that is too low
+and the one that is too high, are weighed as Efron (1983) weighs them in "Estimating the error rate
+of a prediction rule": .632 and .368.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-import gymnasium as gym
 import numpy as np
 
 from skillweave.errors import RunError
 from skillweave.planning.calls import CallLog
 from skillweave.planning.compared import leaves
-from skillweave.planning.graph import CallGraph, are_apart, goal_standard
+from skillweave.planning.graph import are_apart, goal_standard
 from skillweave.planning.handover import wilson
 from skillweave.planning.lacking import names_of, read_log
 from skillweave.planning.machine import RewardMachine, predicates_of
 from skillweave.planning.neighbors import evenly, nearest
 from skillweave.planning.planner import Planner
-from skillweave.policies.core import LastCall, Memory, Turn, World
-from skillweave.policies.hierarchy import SKILL
-from skillweave.policies.parts import GOAL
+from skillweave.policies.core import CallEnd, LastCall, Turn, World
 from skillweave.policies.plan import SOFT, Readings
 from skillweave.policies.planned import SLACK, Planned
-from skillweave.skills.goal_spaces import choice_space
 from skillweave.types import Array
 
-FOLDS = 2
-VARIANT = 0
-FOLLOWED = 3
-EPISODES = 100
-"""Episodes that are followed in each fold."""
-GOALS = 8
-"""The same where each has a goal of its own, which needs a plan of its own."""
+EPISODES = 200
+GOALS = 16
+"""Episodes where each has a goal of its own, which needs a plan of its own."""
+HELD_OUT = 0.632
+"""The weight of the chance by calls that the plan has not chosen by."""
+FEWEST_EPISODES = 4
+"""Episodes of a log from which on its halves judge one another."""
+FOLLOWED = 5
+"""The nearest calls, of which one is followed."""
 MOST_CALLS = 100
 """The most calls of an episode."""
 UNLIKELY = 0.2
 """The chance below which the reason is given."""
 FAR = 2.0
-"""Times the usual distance beyond which a held-out call says nothing."""
+"""Times the usual distance beyond which a logged call says nothing."""
 OFTEN = 0.2
 """The share of a skill's calls from which on it is named as unsure."""
 SHOWN = 6
@@ -53,7 +54,7 @@ SAMPLED = 500
 RARE = 0.1
 """The share of episodes below which a step of the plan does not count to the interval."""
 OTHER_GOAL = np.float32(1e4)
-"""Distance of goals that are compared as different skills are."""
+"""The distance of goals that are compared as different skills are."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +63,18 @@ class Forecast:
 
     Attributes:
         calls: (skill, mean steps) in the most frequent order of calls, of the episodes that succeed
-            if there are any; calls of one skill in a row count as one.
-        chance: of success; None: the task has no accepting state.
-        interval: of the chance, 95 %, by the number of starts in the log.
+            if there are any; calls of one skill in a row count as one, unless it has goals.
+        chance: of success; None: the task has no accepting state, or the log cannot say.
+        interval: of the chance, 95 %, by the logged calls at the step of the plan that has the
+            fewest. Where skills have goals, it reaches from the lower bound by calls that the plan
+            did not choose by, to the upper bound by all.
         steps: the mean steps of these episodes.
         unsure: the skills that are often called where the log has no call of them near.
-        reason: why the chance is small; empty: it is not.
+        reason: why the chance is small or unknown; empty: it is neither.
+        goals: of each of the calls, its goals in words; empty: it has none.
+        already: which words of the mission hold before anything is done; empty: the mission asks
+            for something.
+        episodes: that were played, whose share the chance is; 0: none.
     """
 
     calls: tuple[tuple[str, float], ...]
@@ -76,18 +83,28 @@ class Forecast:
     steps: float
     unsure: tuple[str, ...]
     reason: str
+    goals: tuple[str, ...] = ()
+    already: str = ""
+    episodes: int = 0
 
     def __str__(self) -> str:
         """Return all of it as a line."""
-        names = [f"{name} ({steps:.0f} steps)" for name, steps in self.calls[:SHOWN]]
-        text = " → ".join([*names, "…"] if len(self.calls) > SHOWN else names)
-        if self.chance is not None:
-            low, high = self.interval
+        goals = self.goals or ("",) * len(self.calls)
+        names = [
+            f"{name}{goal and ' '}{goal} ({steps:.0f} steps)"
+            for (name, steps), goal in zip(self.calls, goals, strict=True)
+        ]
+        text = " → ".join([*names[:SHOWN], "…"] if len(names) > SHOWN else names)
+        low, high = self.interval
+        if self.episodes and self.chance is not None:
+            text += f": done in {self.chance:.0%} of {self.episodes} played episodes"
+            text += f" ({low:.0%} to {high:.0%})"
+        elif self.chance is not None:
             text += f": a chance of {self.chance:.0%} ({low:.0%} to {high:.0%})"
         text += f", about {self.steps:.0f} steps"
         if self.unsure:
             text += f"; unsure, as the log has few calls near there: {', '.join(self.unsure)}"
-        return f"{text}; {self.reason}" if self.reason else text
+        return "; ".join([text, *filter(None, (self.reason, self.already))])
 
 
 @dataclass
@@ -99,7 +116,9 @@ class _Followed:
     steps: Array
     """(C, N) int64."""
     call: Array
-    """(C, N) int64, the logged call that was followed."""
+    """(C, N) int64, the logged call that was followed; −1: none was near."""
+    aim: Array
+    """(C, N) int64, the logged call whose goal it had; −1: it had none."""
     state: Array
     """(C, N) int64, of the task before the call."""
     last: Array
@@ -107,11 +126,41 @@ class _Followed:
     done: Array
     """(N,) bool."""
     known: Array
-    """(N,) bool: no call was needed that the log has none near of."""
+    """(N,) bool: the log had a call near wherever one was needed."""
+
+    @property
+    def evidence(self) -> float:
+        """The logged calls by which the scarcest step of the plan was judged.
+
+        A step is a skill in a state of the task. Calls that many episodes followed say no more
+        than one does, so the number is that of equally used calls (Kish 1965).
+        """
+        fewest = np.inf
+        used = self.call >= 0
+        for step in np.unique(np.stack([self.state[used], self.skill[used]]), axis=1).T:
+            calls = self.call[used & (self.state == step[0]) & (self.skill == step[1])]
+            if len(calls) >= RARE * len(self.done):
+                uses = np.bincount(calls).astype(float)
+                fewest = min(fewest, uses.sum() ** 2 / np.square(uses).sum())
+        return float(fewest) if np.isfinite(fewest) else 0.0
+
+    def chance(self, starts: int) -> tuple[float, float, float]:
+        """Return the share of episodes that are done, and the bounds of its interval.
+
+        An episode that the log does not cover counts neither way, for the lower bound as failed,
+        for the upper one as done.
+
+        Args:
+            starts: the logged starts that they are from.
+        """
+        n = min(self.evidence, starts)
+        low, _ = wilson(self.done.mean() * n, n)
+        _, high = wilson((self.done | ~self.known).mean() * n, n)
+        return float(self.done.sum() / max(1, self.known.sum())), float(low), float(high)
 
 
-class HeldOut:
-    """Logged calls that are followed where a plan is judged by others.
+class _Calls:
+    """Logged calls that are followed.
 
     Args:
         planner: of the whole log.
@@ -119,256 +168,284 @@ class HeldOut:
     """
 
     def __init__(self, planner: Planner, some: Array) -> None:
-        self.graph = graph = planner.graph
+        self._graph = graph = planner.graph
         log, pieces = graph.log, graph.pieces
-        self._aims = [goal_standard(log, name) for name in log.skills]
-        self._apart = [_has_few_goals(log, choice) for choice in range(log.choices)]
         starts = log.before[pieces.first]
-        self._calls: list[tuple[Array, Array, float]] = []
+        self._of: list[tuple[Array, Array, float]] = []
+        """Of each choice its pieces, where they start, and the usual distance of others."""
         for choice in range(log.choices):
             rows = np.flatnonzero((pieces.choice == choice) & some[pieces.call])
-            goals = log.goals.get(log.skills[log.skill_of(choice)])
-            goal = None if goals is None else goals[pieces.call[rows]]
-            points = self._at(choice, starts[rows], goal) if len(rows) else np.zeros((0, 1))
-            usual = 0.0
+            usual, points = 0.0, np.zeros((0, 1), np.float32)
             if len(rows):
-                of = evenly(np.arange(len(rows)), SAMPLED)
-                far = nearest(points, points[of], graph.neighbors + 1, pieces.call[rows])[1][:, -1]
-                usual = float(np.median(far))
-            self._calls.append((rows, points, max(usual, SOFT) if np.isfinite(usual) else 1.0))
+                points = self._points(choice, starts[rows], pieces.call[rows])
+                few = points[evenly(np.arange(len(rows)), SAMPLED)]
+                far = nearest(points, few, graph.neighbors + 1, pieces.call[rows])[1]
+                usual = float(np.median(far[:, -1]))
+            # Too few calls to tell: a standard deviation.
+            self._of.append((rows, points, max(usual, SOFT) if np.isfinite(usual) else 1.0))
 
-    def _at(self, choice: int, obs: Array, goal: Array | None) -> Array:
-        """Return the places of calls by which they are compared, (n, F) float32."""
-        skill = self.graph.log.skill_of(choice)
-        found = self.graph.maps[skill](obs)
-        standard = self._aims[skill]
-        if goal is None or standard is None:
-            return found
-        aims = standard(goal) * (OTHER_GOAL if self._apart[choice] else 1.0)
-        return np.concatenate([found, aims], 1, dtype=np.float32)
+    def _points(self, choice: int, obs: Array, aim: Array) -> Array:
+        """Return numbers by which calls are compared, (n, F) float32: of their start and goal.
 
-    def follow(
-        self, choice: int, obs: Array, aim: Array, without: Array, rng: np.random.Generator
-    ) -> tuple[Array, Array]:
-        """Return pieces (n,) of calls near by start and goal; −1: none is; and how far they are."""
-        rows, points, usual = self._calls[choice]
-        n = len(obs)
+        Args:
+            choice: of all these calls.
+            obs: (n, *obs_shape).
+            aim: (n,), the calls of the log that have the goals.
+        """
+        log = self._graph.log
+        skill = log.skill_of(choice)
+        features, name = self._graph.maps[skill](obs), log.skills[skill]
+        standard = goal_standard(log, name)
+        if standard is None:
+            return features
+        mine = log.goals[name][log.choice == choice]
+        apart = are_apart(len(np.unique(mine, axis=0)), len(mine))
+        goals = standard(log.goals[name][aim]) * (OTHER_GOAL if apart else 1.0)
+        return np.concatenate([features, goals], 1, dtype=np.float32)
+
+    def like(self, choice: int, obs: Array, aim: Array, rng: np.random.Generator) -> Array:
+        """Return a piece of a call near by start and goal, (n,) int64; −1: none is near.
+
+        The call that has the goal itself is left out.
+
+        Args:
+            choice: the calls' choice.
+            obs: (n, *obs_shape).
+            aim: (n,), the calls of the log that have the goals; −1: it has none.
+            rng: the source of chance.
+        """
+        rows, points, usual = self._of[choice]
         if not len(rows):
-            return np.full(n, -1), np.full(n, np.inf)
-        log = self.graph.log
-        goals = log.goals.get(log.skills[log.skill_of(choice)])
-        to = self._at(choice, obs, None if goals is None else goals[aim])
-        calls = self.graph.pieces.call[rows]
-        near, far = nearest(points, to, FOLLOWED + without.shape[1], calls)
-        far[(calls[near][:, :, None] == without[:, None]).any(2)] = np.inf
-        order = far.argsort(1, kind="stable")[:, :FOLLOWED]
-        near, far = np.take_along_axis(near, order, 1), np.take_along_axis(far, order, 1)
-        weights = 1.0 / (far + SOFT)
-        weights[~(far <= FAR * np.maximum(far[:, :1], usual))] = 0.0
-        drawn = weights.cumsum(1) < rng.random((n, 1)) * weights.sum(1, keepdims=True)
-        at = np.minimum(drawn.sum(1), near.shape[1] - 1)
-        piece = rows[near[np.arange(n), at]]
-        return np.where(far[:, 0] <= FAR * usual, piece, -1), far[:, 0] / usual
+            return np.full(len(obs), -1)
+        calls = self._graph.pieces.call[rows]
+        near, far = nearest(points, self._points(choice, obs, aim), FOLLOWED + 1, calls)
+        far[calls[near] == aim[:, None]] = np.inf
+        order = far.argsort(axis=1, kind="stable")[:, :FOLLOWED]
+        near, far = (np.take_along_axis(x, order, 1) for x in (near, far))
+        counts = far <= FAR * np.maximum(far[:, :1], usual)
+        weights = np.where(counts & np.isfinite(far), 1.0 / (far + SOFT), 0.0)
+        drawn = weights.cumsum(1) < rng.random((len(obs), 1)) * weights.sum(1, keepdims=True)
+        place = np.minimum(drawn.sum(1), near.shape[1] - 1)
+        piece = rows[near[np.arange(len(obs)), place]]
+        return np.where(far[:, 0] <= FAR * usual, piece, -1)
 
 
 def forecast(planner: Planner) -> Forecast:
     """Return how episodes of a plan probably go.
 
-    Episodes of the log are split into folds. For each, the task is solved without its calls, and
-    then this plan is followed along its calls: from a logged start, each choice is the plan's, with
-    its goal, and one of the nearest held-out calls by start and goal is followed to its end.
+    From logged starts, each choice is the plan's, as it would be played; then one of the nearest
+    logged calls, by start and goal, is followed to its end. Calls that began too late before the
+    time limit of their episode are not followed. Numbers that never change within an episode stay
+    those of the start.
 
     Raises:
         RunError: the log has no start of an episode.
     """
     log, machine = planner.graph.log, planner.machine
-    if not (log.order == 0).any():
+    starts = int((log.order == 0).sum())
+    if not starts:
         raise RunError("the log has no start of an episode, so no plan can be judged by it")
-    known = read_log(machine, log)
-    rng = np.random.default_rng(0)
-    parts = list(_followed(planner, rng))
-    done = np.concatenate([part.done for part in parts])
-    sure = np.concatenate([part.known for part in parts])
-    n = _calls_at_the_scarcest_step(parts)
+    rng, evidence = np.random.default_rng(0), ~log.began_late
+    whole = _follow(planner, planner.in_place, evidence, log.order == 0, rng)
     chance, reason = None, ""
     low, high = 0.0, 1.0
     if machine.accepting.any():
-        chance = float(done.sum() / max(sure.sum(), 1))
-        low = float(wilson(done.mean() * n, n)[0])
-        high = float(wilson((done | ~sure).mean() * n, n)[1])
+        chance, low, high = whole.chance(starts)
+        if any(group.options > 1 for group in planner.graph.options.groups):
+            chance, low, high = _without_luck(planner, (chance, low, high), rng)
         if planner.obstacle:
-            chance = 0.0
-        if chance < UNLIKELY:
-            last = np.concatenate([part.last for part in parts])
-            reason = planner.obstacle or _reason(machine, last[~done], log, known)
-    shown = [part.done if done.any() else np.ones_like(part.done) for part in parts]
+            low, high = (float(x) for x in wilson(0.0, min(EPISODES, starts)))
+            chance, reason = 0.0, planner.obstacle
+        elif chance is None or not whole.known.any():
+            chance, low, high, reason = None, 0.0, 1.0, _unknown(planner)
+        elif chance < UNLIKELY:
+            known = read_log(machine, log)
+            reason = _reason(machine, whole.last[~whole.done], log, known)
+    calls, goals = _usual_calls(planner, whole)
+    shown = whole.done if whole.done.any() else np.ones_like(whole.done)
     return Forecast(
-        _usual_calls(parts, shown, log.skills),
+        calls,
         chance,
         (low, high),
-        float(np.concatenate([p.steps.sum(0)[s] for p, s in zip(parts, shown, strict=True)]).mean()),
-        (),
+        float(whole.steps.sum(0)[shown].mean()),
+        tuple(
+            name
+            for i, name in enumerate(log.skills)
+            if (mine := whole.skill == i).any() and (whole.call[mine] < 0).mean() > OFTEN
+        ),
         reason,
+        goals,
+        planner.already,
     )
 
 
-def _followed(planner: Planner, rng: np.random.Generator) -> Iterator[_Followed]:
-    """Yield the episodes of each half of the log."""
+def _without_luck(
+    planner: Planner, whole: tuple[float, float, float], rng: np.random.Generator
+) -> tuple[float | None, float, float]:
+    """Return the chance of a plan with goals, and its bounds.
+
+    Args:
+        planner: with the plan.
+        whole: the chance by all calls, and its bounds.
+        rng: the source of chance.
+
+    Returns:
+        They are None, 0 and 1 where the log has too few episodes.
+    """
     log = planner.graph.log
-    fold = np.unique(log.episode, return_inverse=True)[1].reshape(-1) % FOLDS
-    for number in range(FOLDS):
-        own = fold == number
-        if VARIANT == 2: yield _follow(planner, _acting(planner, ~own), own, rng)
-        else: yield _follow(planner, planner.in_place, np.ones_like(own), rng)
+    number = np.unique(log.episode, return_inverse=True)[1].reshape(-1)
+    if number.max() + 1 < FEWEST_EPISODES:
+        return None, 0.0, 1.0
+    halves, first = [], log.order == 0
+    for half in (number % 2 == 0, number % 2 == 1):
+        acting = copy.copy(planner.in_place)
+        acting.options = planner.graph.options.of_calls(half)
+        if (first & ~half).any():
+            followed = _follow(planner, acting, ~half & ~log.began_late, first & ~half, rng)
+            halves.append(followed.chance(int((first & ~half).sum())))
+    held_out = np.mean(halves, 0)
+    low, high = _pooled(halves)
+    chance = HELD_OUT * held_out[0] + (1 - HELD_OUT) * whole[0]
+    return float(chance), min(low, chance), max(high, whole[2], chance)
 
 
 def _follow(
-    planner: Planner, acting: Planned, own: Array, rng: np.random.Generator
+    planner: Planner, acting: Planned, some: Array, first_of: Array, rng: np.random.Generator
 ) -> _Followed:
-    """Return episodes that follow a plan along calls that it has not seen."""
+    """Return episodes that follow a plan along logged calls.
+
+    Args:
+        planner: with the plan.
+        acting: chooses.
+        some: (C,) bool, the calls that may be followed.
+        first_of: (C,) bool, the calls in whose starts episodes start.
+        rng: the source of chance.
+    """
     graph, machine, observed = planner.graph, planner.machine, planner.observed
-    held_out = HeldOut(planner, own)
-    log = graph.log
-    starts = np.flatnonzero((log.order == 0) & own)
+    log, calls = graph.log, _Calls(planner, some)
+    starts = np.flatnonzero(first_of)
     n = EPISODES if observed is None else GOALS
     first = log.start[starts[np.arange(n) * len(starts) // n]]
     before = log.before
     fixed = [(a == b).all(0) for a, b in zip(*map(leaves, (before, log.next_obs)), strict=True)]
-    limit = _limit(planner.log)
-    readings = read_log(machine, log)
-    obs, memory = first.copy(), acting.start(n)
-    elapsed, may = np.zeros(n, np.int64), np.ones((n, log.choices), bool)
+    limit = planner.log.time_limit or np.inf
+    known = read_log(machine, log)
+    obs, memory, elapsed = first.copy(), acting.start(n), np.zeros(n, np.int64)
+    may, running = np.ones((n, log.choices), bool), np.ones(n, bool)
     if graph.skills is not None:
         may = graph.skills.hierarchy.may_start(first)
-    running, known = np.ones(n, bool), np.ones(n, bool)
-    shape = (MOST_CALLS, n)
     history = _Followed(
-        *(np.full(shape, -1) for _ in range(4)), np.zeros(n, np.int64), running, known
-    )
-    history.steps[:] = 0
+        *(np.full((MOST_CALLS, n), empty) for empty in (-1, 0, -1, -1, -1)),
+        last=np.zeros(n, np.int64), done=np.zeros(n, bool), known=np.ones(n, bool),
+    )  # fmt: skip
     for number in range(MOST_CALLS):
         here = np.flatnonzero(running)
         may_here = may[here] | ~may[here].any(1, keepdims=True)
-        option, near = acting.decide(memory, here, obs[here], Turn(World(rng), may_here), True)
-        choice, each = graph.choice_of[option], np.arange(len(here))
-        aim, piece = near.goal[each, option], np.full(len(here), -1)
-        judges = np.where(np.isfinite(near.weights[each, option]), graph.pieces.call[near.pieces[each, option]], -1)
-        for one in np.unique(choice):
-            mine = np.flatnonzero(choice == one)
-            without = aim[mine, None]
-            if VARIANT == 1 and (aim[mine]>=0).all(): without = np.concatenate([without, judges[mine]], 1)
-            piece[mine] = held_out.follow(int(one), obs[here[mine]], aim[mine], without, rng)[0]
-        unknown = piece < 0
-        known[here[unknown]] = running[here[unknown]] = False
         history.state[number, here] = memory["state"][here]
-        history.skill[number, here] = log.skill_of(choice)
-        here, piece, choice = here[~unknown], piece[~unknown], choice[~unknown]
+        option, near = acting.decide(memory, here, obs[here], Turn(World(rng), may_here), True)
+        choice, aim = graph.choice_of[option], near.goal[np.arange(len(here)), option]
+        history.skill[number, here], history.aim[number, here] = log.skill_of(choice), aim
+        piece = np.full(len(here), -1)
+        for one in np.unique(choice).tolist():
+            mine = choice == one
+            piece[mine] = calls.like(one, obs[here[mine]], aim[mine], rng)
+        unknown = here[piece < 0]
+        history.known[unknown] = running[unknown] = False
+        here, choice, piece = (x[piece >= 0] for x in (here, choice, piece))
         if not len(here):
             break
         history.call[number, here] = graph.pieces.call[piece]
         step, end = graph.pieces.first[piece], graph.end_of[piece]
-        last = LastCall(log.skill_of(choice), np.zeros(len(here), np.int8), np.zeros(len(here), bool))
-        goes_on = np.ones(len(here), bool)
+        goes_on, skill = np.ones(len(here), bool), log.skill_of(choice)
         while goes_on.any():
-            some, steps = here[goes_on], step[goes_on]
-            read = readings.take(steps)
+            now, steps = here[goes_on], step[goes_on]
+            readings = known.take(steps)
             if observed is not None:  # the goal is that of the episode, not of the logged call
-                there = observed.holds(log.next_obs[steps], observed.of(first[some]))
-                read.events[:, 0] = there
-            of = LastCall(*(x[goes_on] for x in (last.skill, last.why, last.succeeded)))
-            acting.follow(memory, some, read, of)
-            elapsed[some] += 1
-            history.steps[number, some] += 1
+                there = observed.holds(log.next_obs[steps], observed.of(first[now]))
+                readings.events[:, 0] = there
+            acting.follow(memory, now, readings, _running(skill[goes_on]))
+            elapsed[now] += 1
+            history.steps[number, now] += 1
             step += goes_on
             goes_on &= (step <= graph.end_step[end]) & (elapsed[here] < limit)
-            goes_on &= ~machine.is_over(_state(memory, here))
-        is_over = machine.is_over(_state(memory, here)) | (elapsed[here] >= limit) | planner.over[end]
-        running[here[is_over]] = False
-        # An end is one of here where the call moved further than its start is away.
-        begins = before[graph.pieces.first[piece]]
-        skill = log.skill_of(choice)
-        off = np.maximum(_shift(graph, skill, begins, obs[here]), SLACK)
-        moved = _shift(graph, skill, begins, graph.end[end]) > off
+            goes_on &= ~machine.is_over(acting.state_of(memory, here))
+        over = machine.is_over(acting.state_of(memory, here)) | (elapsed[here] >= limit)
+        running[here[over | planner.over[end]]] = False
         may[here] = graph.may[end]
+        # A call that moved no further than it started away led nowhere.
+        begins = before[graph.pieces.first[piece]]
+        off = np.maximum(_shift(planner, skill, begins, obs[here]), SLACK)
+        moved = _shift(planner, skill, begins, graph.end[end]) > off
         obs[here[moved]] = graph.end[end[moved]]
-        for mine, start, same in zip(leaves(obs), leaves(first), fixed, strict=True):
-            np.copyto(mine, start, where=same)
+        for own, start, same in zip(leaves(obs), leaves(first), fixed, strict=True):
+            np.copyto(own, start, where=same)
         if not running.any():
             break
-    everywhere = np.arange(n)
-    history.last = memory["state"]
-    history.done = machine.has_succeeded(_state(memory, everywhere))
-    history.known = known
+    state = acting.state_of(memory, np.arange(n))
+    history.last, history.done = state[:, 0], machine.has_succeeded(state)
     return history
 
 
-def _has_few_goals(log: CallLog, choice: int) -> bool:
-    """Return whether each goal of a choice is as another skill would be."""
-    goals, mine = log.goals.get(log.skills[log.skill_of(choice)]), log.choice == choice
-    return goals is not None and are_apart(len(np.unique(goals[mine], axis=0)), int(mine.sum()))
+def _pooled(halves: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
+    """Return the bounds of the mean of independent chances, each given with its bounds."""
+    chance, low, high = np.array(halves).T
+    below = np.sqrt(np.square(chance - low).sum()) / len(chance)
+    above = np.sqrt(np.square(high - chance).sum()) / len(chance)
+    middle = chance.mean()
+    return float(max(0.0, middle - below)), float(min(1.0, middle + above))
 
 
-def _limit(log: CallLog) -> float:
-    """Return the episode's time limit by the log; infinite: it shows none."""
-    return float((log.age + log.tau)[log.was_cut].max(initial=0) or np.inf)
+def _running(skill: Array) -> LastCall:
+    """Return that calls of skills (k,) go on."""
+    n = len(skill)
+    return LastCall(skill, np.full(n, CallEnd.RUNNING, np.int8), np.zeros(n, bool))
 
 
-def _acting(planner: Planner, some: Array) -> Planned:
-    """Return the rule that acts by a plan and some of its calls."""
-    return replace(planner.in_place, options=planner.graph.options.of_calls(some))
-
-
-def _state(memory: Memory, rows: Array) -> Array:
-    """Return the task's state in a memory, (k, 1 + H)."""
-    return np.concatenate([memory["state"][rows, None], memory["counters"][rows]], 1)
-
-
-def _shift(graph: CallGraph, skill: Array, one: Array, other: Array) -> Array:
+def _shift(planner: Planner, skill: Array, one: Array, other: Array) -> Array:
     """Return the distances (n,) between observations, as the skills of calls see them."""
     shift = np.zeros(len(skill))
     for i in np.unique(skill):
-        mine, features = skill == i, graph.maps[i]
+        mine, features = skill == i, planner.graph.maps[i]
         shift[mine] = np.linalg.norm(features(one[mine]) - features(other[mine]), axis=1)
     return shift
 
 
-def _calls_at_the_scarcest_step(parts: Sequence[_Followed]) -> float:
-    """Return the held-out calls by which the scarcest step of a plan was judged.
-
-    A step is a skill in a state of the task. A call that many episodes followed counts once, so
-    the number is that of equally used calls (Kish 1965).
-    """
-    episodes = sum(len(part.done) for part in parts)
-    uses: dict[tuple[int, int], dict[tuple[int, int], int]] = {}
-    for fold, part in enumerate(parts):
-        used = np.flatnonzero((part.call >= 0).reshape(-1))
-        rows = zip(
-            part.state.reshape(-1)[used].tolist(),
-            part.skill.reshape(-1)[used].tolist(),
-            part.call.reshape(-1)[used].tolist(),
-            strict=True,
-        )
-        for state, skill, call in rows:
-            of = uses.setdefault((state, skill), {})
-            of[fold, call] = of.get((fold, call), 0) + 1
-    counts = [np.array([*of.values()]) for of in uses.values()]
-    often = [x for x in counts if x.sum() >= RARE * episodes]
-    return min((float(x.sum() ** 2 / np.square(x).sum()) for x in often), default=0.0)
-
-
 def _usual_calls(
-    parts: Sequence[_Followed], shown: Sequence[Array], skills: tuple[str, ...]
-) -> tuple[tuple[str, float], ...]:
-    """Return the most frequent order of skills, with the mean steps of each."""
-    orders: dict[tuple[int, ...], list[Array]] = {}
-    for part, some in zip(parts, shown, strict=True):
-        for skill, steps in zip(part.skill[:, some].T, part.steps[:, some].T, strict=True):
-            called = np.flatnonzero(skill >= 0)
-            first = called[np.diff(skill[called], prepend=-1) != 0]
-            sums = np.add.reduceat(steps[: len(called)], first)
-            orders.setdefault(tuple(skill[first].tolist()), []).append(sums)
-    order, steps = max(orders.items(), key=lambda item: len(item[1]))
-    return tuple((skills[i], s) for i, s in zip(order, np.mean(steps, 0).tolist(), strict=True))
+    planner: Planner, followed: _Followed
+) -> tuple[tuple[tuple[str, float], ...], tuple[str, ...]]:
+    """Return the most frequent order of skills, with the mean steps of each, and their goals."""
+    log = planner.graph.log
+    with_goals = np.array([name in log.goals for name in log.skills])
+    orders: dict[tuple[int, ...], list[tuple[Array, Array]]] = {}
+    shown = followed.done if followed.done.any() else np.ones_like(followed.done)
+    for e in np.flatnonzero(shown).tolist():
+        skill = followed.skill[:, e]
+        called = np.flatnonzero(skill >= 0)
+        new = np.diff(skill[called], prepend=-1) != 0
+        first = called[new | with_goals[skill[called]]]
+        sums = np.add.reduceat(followed.steps[: len(called), e], first)
+        orders.setdefault(tuple(skill[first].tolist()), []).append((sums, followed.aim[first, e]))
+    order, episodes = max(orders.items(), key=lambda item: len(item[1]))
+    steps, aims = (np.array(column) for column in zip(*episodes, strict=True))
+    calls = zip(order, steps.mean(0).tolist(), strict=True)
+    goals = [planner.shown_goals(i, aims[:, place]) for place, i in enumerate(order)]
+    return tuple((log.skills[i], mean) for i, mean in calls), tuple(goals)
+
+
+def _unknown(planner: Planner) -> str:
+    """Return why the log cannot say how likely a plan is."""
+    log = planner.graph.log
+    if (episodes := len(np.unique(log.episode))) < FEWEST_EPISODES:
+        return (
+            f"the log has {episodes} episode{'s' * (episodes != 1)}, and goals are judged by other "
+            f"episodes than they are chosen by: record at least {FEWEST_EPISODES}"
+        )
+    if log.began_late.mean() > 0.5:
+        return (
+            f"{log.began_late.mean():.0%} of the logged calls began too late to run their whole "
+            "length before the time limit of their episode: record calls in longer episodes"
+        )
+    return "the log has no calls near where the plan leads: record more"
 
 
 def _reason(machine: RewardMachine, state: Array, log: CallLog, known: Readings) -> str:
@@ -381,5 +458,7 @@ def _reason(machine: RewardMachine, state: Array, log: CallLog, known: Readings)
             if holds > 0.5:
                 bad = names_of([arrow])
                 return f"{bad}, which is avoided, holds in {holds:.0%} of the first steps"
+    if not len(state):
+        return "its calls succeed in the log by luck: calls of the same goals mostly fail"
     stuck = machine.state_names[int(np.bincount(state).argmax())]
     return f"most episodes end in the state {stuck!r}"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from html import escape
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,21 @@ Z = 1.96
 """Standard deviations of a 95 % interval."""
 NEIGHBORS = 5
 LEAST = 20
-"""The fewest calls from which something is concluded."""
+"""The fewest calls from which something is concluded in any case."""
+FEW = 5
+"""The fewest calls that are called weak, where they are clearly worse than the others."""
+CHANCE = 0.01
+"""The chance that any pair of a matrix is called weak where all are alike."""
+GOOD = 0.95
+"""A pair that is done at least this often is not weak."""
+DOUBTFUL = 0.1
+"""A pair with few calls may be weak where it is done so much less often than elsewhere."""
+ALIKE = 0.02
+"""Ends are alike where no number has a larger deviation, relative to its range over the log."""
+SELDOM = 0.25
+"""A skill is seldom done where its rate is clearly below."""
+SHOWN = 4
+"""Pairs that a sentence names at most."""
 BEST = 1 / 3
 """The share of the first skill's ends that are compared with the others."""
 LIKE_ELSEWHERE = 0.1
@@ -48,17 +63,24 @@ class Handover:
         before: "start" and the skills, the rows.
         calls: (S + 1, S) int64.
         done: (S + 1, S) int64.
-        cut: (S,) int64, calls of each skill that were left out, as the episode's time limit cut
-            them.
+        began_late: (S + 1, S) int64, calls that are left out, as they began too late to run their
+            whole length before the episode's time limit.
         by_itself: skills without a ``success`` and an event of ``done``: a call of theirs is done
             if it ended by itself.
+        time_limit: the steps after which episodes are truncated; 0: none is seen.
+        needed: (S + 1, S) int64, the steps of an episode in which half of the calls that began too
+            late would have counted, 0: there were none; None: unknown.
+        steps: the logged steps; 0: unknown.
     """
 
     skills: tuple[str, ...]
     calls: Array
     done: Array
-    cut: Array
+    began_late: Array
     by_itself: tuple[str, ...] = ()
+    time_limit: int = 0
+    needed: Array | None = None
+    steps: int = 0
 
     @property
     def before(self) -> tuple[str, ...]:
@@ -91,14 +113,33 @@ class Handover:
         place = self.before.index(after), self.skills.index(skill)
         return float(self.rate[place]), int(self.calls[place])
 
-    def weakest(self, least: int = 20) -> list[str]:
-        """Return sentences on the skills that are never done, and on weak handovers.
+    def weakest(self, least: int = FEW) -> list[str]:
+        """Return sentences on the skills that are never done, on weak handovers, and on few calls.
 
-        A handover is weak where a skill is done much less often after one skill than elsewhere.
+        A handover is weak where a skill is done less often after one skill than elsewhere, and by
+        more than chance, though there are many pairs (Fisher's exact test). Pairs that may be weak,
+        but have too few calls to say so, are named, with the logged steps that it takes; and pairs
+        whose calls began too late to count.
 
         Args:
             least: the fewest calls that count.
         """
+        few = (self.calls > 0) & (self.calls < LEAST) & ~self._is_weak(least)
+        weak = [*self.weak_sentences(least), *self._seldom(least)]
+        return [*weak, *self._doubtful(few), *self._without_time()]
+
+    def _seldom(self, least: int) -> list[str]:
+        """Return a sentence on each skill that is seldom done, wherever it is called."""
+        calls, done = self.calls.sum(0), self.done.sum(0)
+        seldom = (calls >= least) & (done > 0) & (wilson(done, calls)[1] < SELDOM)
+        seldom &= ~np.isin(self.skills, self.by_itself)
+        return [
+            f"{self.skills[j]!r} succeeds in only {shown_rate(done[j], calls[j])} in all"
+            for j in np.flatnonzero(seldom)
+        ]
+
+    def weak_sentences(self, least: int = FEW) -> list[str]:
+        """Return the sentences of ``weakest`` on the places of ``weak``."""
         never, (calls, done) = self._never(least), self._elsewhere
         sentences = [
             f"{skill!r} succeeds in {shown_rate(0, count)}, whatever came before"
@@ -115,6 +156,56 @@ class Handover:
             sentences.append(f"{skill!r} {does} in {here} {where}; in {elsewhere} elsewhere")
         return sentences
 
+    def _doubtful(self, few: Array) -> list[str]:
+        """Return a sentence on the pairs ``few`` (S + 1, S) that may be weak, if there are any."""
+        calls, done = self._elsewhere
+        with np.errstate(invalid="ignore"):
+            worse = self.rate < done / np.where(calls > 0, calls, np.nan) - DOUBTFUL
+        if not (few & worse).any():
+            return []
+        pairs = self._pairs(
+            few & worse, lambda place: shown_rate(self.done[place], self.calls[place])
+        )
+        more = "record more calls"
+        if self.steps:
+            steps = rounded_up(self.steps * LEAST / int(self.calls[few & worse].min()))
+            more = f"with about {steps:,} logged steps, in place of {self.steps:,}, it has {LEAST}"
+        return [f"Too few calls to say whether a handover is weak: {pairs}; {more}"]
+
+    def _without_time(self) -> list[str]:
+        """Return a sentence on the pairs most of whose calls began too late; none if none is."""
+        place = (self.calls < LEAST) & (self.began_late > np.maximum(self.calls, 2))
+        if not place.any():
+            return []
+        pairs = self._pairs(place, lambda at: f"{self.calls[at]:,} of {self._all[at]:,} calls")
+        return [f"Too few calls begin early enough to count: {pairs}; {self._more_time(place)}"]
+
+    def _more_time(self, place: Array) -> str:
+        """Return words on what makes the calls of pairs ``place`` (S + 1, S) count."""
+        assert self.needed is not None
+        needed = int(np.median(self.needed[place]))
+        return (
+            f"that takes episodes of about {needed:,} steps, in place of {self.time_limit:,}, or "
+            "shorter calls (call_steps, max_steps)"
+        )
+
+    def _pairs(self, place: Array, words: Callable[[tuple[int, int]], str]) -> str:
+        """Return a list of the pairs ``place`` (S + 1, S) bool, with words on each."""
+        at = [(i, j) for j, i in np.argwhere(place.T).tolist()]
+        each = [
+            f"{self.skills[j]!r} {f'after {self.before[i]!r}' if i else 'at the start'} "
+            f"({words((i, j))})"
+            for i, j in at[:SHOWN]
+        ]
+        more = [f"{len(at) - SHOWN} more"] if len(at) > SHOWN else []
+        return ", ".join([*each, *more])
+
+    @property
+    def _all(self) -> Array:
+        """Calls of each pair, with those that began too late, (S + 1, S)."""
+        every: Array = self.calls + self.began_late
+        return every
+
     @property
     def _elsewhere(self) -> tuple[Array, Array]:
         """Calls of each skill in the other rows, and of these that were done, (S + 1, S) each."""
@@ -125,13 +216,22 @@ class Handover:
         never: Array = (self.calls.sum(0) >= least) & ~self.done.any(0)
         return never & ~np.isin(self.skills, self.by_itself)
 
-    def weak(self, least: int = 20) -> list[tuple[int, int]]:
-        """Return the places (row, column) that ``weakest`` is about."""
+    def _is_weak(self, least: int) -> Array:
+        """Return the places of ``weak`` as a mask, (S + 1, S) bool."""
         calls, done = self._elsewhere
-        weak = (self.calls >= least) & (calls >= least)
-        weak &= self.interval[1] < wilson(done, calls)[0]
-        weak |= self._never(least) & (self.calls > 0)
-        return [(i, j) for j, i in np.argwhere(weak.T).tolist()]
+        compared = (self.calls > 0) & (calls > 0)
+        worse = compared & (self.calls >= least) & (calls >= least) & (self.rate < GOOD)
+        weak = self._never(least) & (self.calls > 0)
+        for i, j in np.argwhere(worse & (self.rate * calls < done)).tolist():
+            chance = _chance_of_fewer(
+                int(self.done[i, j]), int(self.calls[i, j]), int(done[i, j]), int(calls[i, j])
+            )
+            weak[i, j] |= chance < CHANCE / int(compared.sum())
+        return weak
+
+    def weak(self, least: int = FEW) -> list[tuple[int, int]]:
+        """Return the places (row, column) of skills that are never done, and of weak handovers."""
+        return [(i, j) for j, i in np.argwhere(self._is_weak(least).T).tolist()]
 
     @property
     def meaning(self) -> str:
@@ -143,6 +243,19 @@ class Handover:
             return "No success() is known: a call is done if it ended by itself."
         return f"A call is done if it succeeded; without success() ({names}) if it ended by itself."
 
+    @property
+    def left_out(self) -> str:
+        """A sentence on the calls that began too late; empty: there were none."""
+        late = int(self.began_late.sum())
+        if not late:
+            return ""
+        few = (self.calls < LEAST) & (self.began_late > np.maximum(self.calls, 2))
+        more = f". Some pairs have few calls left; {self._more_time(few)}" if few.any() else ""
+        return (
+            f"Left out, as they began too late to run their whole length before the episode's time "
+            f"limit of {self.time_limit:,} steps: {late:,} call{'s' * (late != 1)}{more}."
+        )
+
     def to_json(self) -> dict[str, Any]:
         """Return the counts, and the sentences of ``weakest``, as plain JSON."""
         return {
@@ -150,8 +263,9 @@ class Handover:
             "before": list(self.before),
             "calls": self.calls.tolist(),
             "done": self.done.tolist(),
-            "cut": self.cut.tolist(),
+            "began_late": self.began_late.tolist(),
             "by_itself": list(self.by_itself),
+            "time_limit": self.time_limit,
             "weakest": self.weakest(),
         }
 
@@ -170,10 +284,12 @@ class Handover:
 
     def __str__(self) -> str:
         """Return the matrix as a table of text: rates, calls, intervals, what is done."""
-        return f"{aligned([('after', *self.skills), *self.rows()])}\n{self.meaning}"
+        words = " ".join(filter(None, (self.meaning, self.left_out)))
+        return f"{aligned([('after', *self.skills), *self.rows()])}\n{words}"
 
     def _repr_html_(self) -> str:
-        return table(["after", *self.skills], self.rows()) + f"<p>{escape(self.meaning)}</p>"
+        words = " ".join(filter(None, (self.meaning, self.left_out)))
+        return table(["after", *self.skills], self.rows()) + f"<p>{escape(words)}</p>"
 
 
 @dataclass(frozen=True)
@@ -189,20 +305,28 @@ class Chain:
     """The factors of the product."""
     calls: tuple[int, ...]
     """The number of calls that each factor was counted from."""
+    interval: tuple[float, float]
+    """Of the estimate, 95 %, by the episodes whose calls count at the scarcest step."""
 
     def __str__(self) -> str:
         """Return the estimate and the product as a sentence."""
-        text = f"{' then '.join(self.skills)}: {self.estimate:.0%} along the logged calls; "
+        low, high = self.interval
+        text = (
+            f"{' then '.join(self.skills)}: {self.estimate:.0%} ({low:.0%} to {high:.0%}) along "
+            "the logged calls; "
+        )
         if 0 in self.calls:
             name = self.skills[self.calls.index(0)]
-            return f"{text}no product, as no logged call of {name!r} came right after"
+            return f"{text}no product, as no logged call of {name!r} came right after and counts"
         factors = " × ".join(
             f"{rate:.0%} of {calls:,}" for rate, calls in zip(self.rates, self.calls, strict=True)
         )
         return f"{text}{self.product:.0%} as the product {factors}"
 
 
-def pair_counts(before: Array, skill: Array, won: Array, count: int) -> tuple[Array, Array]:
+def pair_counts(
+    before: Array, skill: Array, won: Array, count: int, counts: Array | None = None
+) -> tuple[Array, Array]:
     """Return how many calls follow each skill, and how many of these were done, (S + 1, S) each.
 
     Args:
@@ -210,7 +334,10 @@ def pair_counts(before: Array, skill: Array, won: Array, count: int) -> tuple[Ar
         skill: (C,) columns.
         won: (C,) bool, the calls that were done.
         count: S.
+        counts: (C,) bool, the calls that are counted; None: all.
     """
+    if counts is not None:
+        before, skill, won = before[counts], skill[counts], won[counts]
     place, shape = before * count + skill, (count + 1, count)
     calls, done = (np.bincount(x, minlength=np.prod(shape)) for x in (place, place[won]))
     return calls.reshape(shape), done.reshape(shape)
@@ -223,12 +350,16 @@ def before_each(log: CallColumns, won: Array, only_after_done: bool = True) -> A
         won: (C,) bool, the calls that were done.
         only_after_done: as for ``CallLog.handover``.
     """
+    return np.where(log.began_late, -1, _row_of_each(log, won, only_after_done))
+
+
+def _row_of_each(log: CallColumns, won: Array, only_after_done: bool) -> Array:
+    """Return ``before_each``, with the calls that began too late."""
     before = np.full(len(log), -1)
     following = log.followed_by
     first = np.flatnonzero((following >= 0) & (won | (not only_after_done)))
     before[following[first]] = log.skill[first] + 1
     before[log.order == 0] = 0
-    before[log.was_cut & ~won] = -1
     return before
 
 
@@ -297,6 +428,79 @@ def wilson(successes: Any, trials: Any) -> tuple[Array, Array]:
     return low, np.where(n > 0, np.clip(middle + half, 0.0, 1.0), 1.0)
 
 
+def _others(starts: Array, ends: Array, calls: Array, own: Array) -> tuple[Array, Array]:
+    """Return the nearest calls to ends, and their weights, (n, K) each.
+
+    The call that followed an end is left out: its outcome would be its own forecast.
+
+    Args:
+        starts: (m, F) of calls.
+        ends: (n, F).
+        calls: (m,) the calls' numbers.
+        own: (n,) the number of the call that followed each end; −1: none.
+    """
+    near, distance = nearest(starts, ends, NEIGHBORS + 1, calls)
+    is_own = (calls[near] == own[:, None]) & (np.isfinite(distance).sum(1) > 1)[:, None]
+    distance = np.where(is_own, np.inf, distance)
+    order = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBORS]
+    near, distance = (np.take_along_axis(x, order, 1) for x in (near, distance))
+    return near, weights_of(distance)
+
+
+def _bounds(estimate: float, share: Array, episode: Array) -> tuple[float, float]:
+    """Return a 95 % interval of a chance, as far as it follows from the calls of one step.
+
+    Calls of one episode are not independent, and few of them may count for most.
+
+    Args:
+        estimate: the chance of all steps.
+        share: (n,) of the chains that come by each call of the step.
+        episode: (n,) of each call.
+    """
+    reached = float(share.sum())
+    if not reached:
+        return 0.0, 1.0
+    by_episode = np.bincount(np.unique(episode, return_inverse=True)[1], share)
+    count = reached**2 / float(np.square(by_episode).sum())
+    low, high = wilson(estimate / reached * count, count)
+    return reached * float(low), reached * float(high)
+
+
+def _chance_of_fewer(done: int, calls: int, done_elsewhere: int, calls_elsewhere: int) -> float:
+    """Return the chance of at most ``done`` of ``calls``, if it is as elsewhere (Fisher 1934)."""
+    won, all_calls = done + done_elsewhere, calls + calls_elsewhere
+    logs = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, all_calls + 1)))])
+
+    def choose(n: int, k: Array) -> Array:
+        ways: Array = logs[n] - logs[k] - logs[n - k]
+        return ways
+
+    k = np.arange(max(0, calls - (all_calls - won)), done + 1)
+    ways = choose(won, k) + choose(all_calls - won, calls - k) - choose(all_calls, np.array(calls))
+    return float(np.exp(ways).sum())
+
+
+def rounded_up(number: float) -> int:
+    """Return a number with its first two digits, rounded up."""
+    unit = int(10 ** max(0, len(str(int(number))) - 2))
+    return int(-(-number // unit)) * unit
+
+
+def began_late_words(calls: int, time_limit: int, needed: int) -> str:
+    """Return words on calls that are left out, as they began too late.
+
+    Args:
+        calls: how many.
+        time_limit: the steps after which episodes are truncated.
+        needed: the steps of an episode in which half of them would have counted.
+    """
+    return (
+        f"{calls:,} began too late to run their whole length before the episode's time limit of "
+        f"{time_limit:,} steps; that takes episodes of about {needed:,} steps, or shorter calls "
+        "(call_steps, max_steps)"
+    )
+
+
 def shown_rate(done: float, calls: float, what: str = " calls") -> str:
     """Return a share with its count and its 95 % interval, in words."""
     low, high = wilson(done, calls)
@@ -323,6 +527,12 @@ class Blame:
         means: its mean at the best ends, and at the others.
         reasons: how the calls that failed ended: own, limit, interrupted, episode.
         first: True if other ends of the first skill would do, so that it is to blame.
+        works: where the second skill is clearly more often done: the skill before ("start": none),
+            its calls that are done there, and all.
+        differs: the number of the flat observation, of those that the first skill changes, in which
+            the starts of these calls differ most from those after it, its mean there, and here;
+            None: they differ in none.
+        alike: True if all ends of the first skill are alike.
     """
 
     skill: str
@@ -337,6 +547,9 @@ class Blame:
     means: tuple[float, float]
     reasons: dict[str, int]
     first: bool
+    works: tuple[tuple[str, int, int], ...] = ()
+    differs: tuple[int, float, float] | None = None
+    alike: bool = False
 
     @property
     def fine(self) -> bool:
@@ -359,6 +572,8 @@ class Blame:
                 if count
             )
             parts.append(f"Of the calls that failed, {words}")
+            if self.reasons.get("limit") == failed:
+                parts.append("So they may need more steps (call_steps, max_steps)")
         if self.fine:
             parts.append("That is no worse than elsewhere, so neither skill is to blame")
         elif self.after == START:
@@ -368,19 +583,52 @@ class Blame:
                 f"These are too few calls to say which skill is to blame (at least {LEAST})"
             )
         else:
-            third = _third(self.calls)
-            best = shown_rate(self.best * third, third)
-            worse = shown_rate(self.others * (self.calls - third), self.calls - third)
-            parts.append(
-                f"{self.after!r} is to blame for where it ends: from the best third of its ends "
-                f"{self.skill!r} is done in {best}, from the others in {worse}"
-                f"{self._difference()}"
-                if self.first
-                else f"It would not help if {self.after!r} ended elsewhere: "
-                f"from the best third of its ends {self.skill!r} is done in {best}. So "
-                f"{self.skill!r} itself has to work from there"
-            )
+            parts.append(self._verdict())
+        if not self.fine and not self.first and self.works:
+            parts.append(self._elsewhere())
         return ". ".join(parts) + "."
+
+    def _verdict(self) -> str:
+        """Return words on which of the two skills is to blame."""
+        third = _third(self.calls)
+        best = shown_rate(self.best * third, third)
+        worse = shown_rate(self.others * (self.calls - third), self.calls - third)
+        if self.first:
+            return (
+                f"{self.after!r} is to blame for where it ends: from the best third of its ends "
+                f"{self.skill!r} is done in {best}, from the others in {worse}{self._difference()}"
+            )
+        if self.alike:
+            ends = (
+                f"All ends of {self.after!r} are alike, so they do not say whether others would do"
+            )
+        else:
+            ends = f"From the best third of the ends of {self.after!r} it is done in {best}"
+        if self.works:
+            return ends
+        return f"{ends}. So {self.skill!r} itself has to work from there"
+
+    def _elsewhere(self) -> str:
+        """Return words on where the second skill works, and how these starts differ."""
+        where = ", ".join(
+            f"{'at the start of an episode' if name == START else f'after {name!r}'} "
+            f"({shown_rate(done, calls)})"
+            for name, done, calls in self.works[:SHOWN]
+        )
+        text = f"{self.skill!r} works {where}"
+        if self.differs is not None:
+            place, there, here = self.differs
+            text += (
+                f", where number {place} of the observation is {there:.2g} at the start of its "
+                f"calls, and {here:.2g} here"
+            )
+        if self.after == START:
+            return f"{text}; it has to learn to start here, too"
+        ends = "" if self.differs is None else f"{self.after!r} has to end as these do, "
+        return (
+            f"{text}. So {ends}another skill has to come in between, or {self.skill!r} has to "
+            f"learn to start where {self.after!r} ends"
+        )
 
     def _difference(self) -> str:
         if self.place is None:
@@ -422,7 +670,13 @@ def _predicted(at: Array, won: Array, known: Array, rows: Array) -> Array:
 def _largest_difference(
     vector: Array, best: Array, changes: Array
 ) -> tuple[int | None, tuple[float, float]]:
-    """Return the number that differs most between two groups of ends, of those that change."""
+    """Return the number that differs most between two groups of starts, of those that change.
+
+    Args:
+        vector: (n, F) of the starts.
+        best: (n,) bool, those of the first group.
+        changes: (F,) bool, the numbers that count.
+    """
     if not changes.any():
         return None, (float("nan"), float("nan"))
     one, other = vector[best].mean(0), vector[~best].mean(0)
@@ -441,8 +695,10 @@ class LinkedCalls(CallColumns):
     ) -> Handover:
         """Count how often each skill is done after each other one.
 
-        A row counts the calls that follow a call of its skill. Calls that the episode's time limit
-        cut before they were done are left out.
+        A row counts the calls that follow a call of its skill. A call that began too late to run
+        its whole length before the episode's time limit is left out, whatever its outcome. Its
+        whole length is its limit; without one, the longest call of that skill that came to its own
+        end.
 
         Args:
             done: by skill, the event that its calls are for, in place of the skill's ``success``:
@@ -456,16 +712,32 @@ class LinkedCalls(CallColumns):
         """
         count = len(self.skills)
         won = calls_done(self, done)
-        before = before_each(self, won, only_after_done)
-        rows = np.flatnonzero(before >= 0)
-        calls, did = pair_counts(before[rows], self.skill[rows], won[rows], count)
-        cut = np.bincount(self.skill[self.was_cut & ~won], minlength=count)
+        before = _row_of_each(self, won, only_after_done)
         by_itself = tuple(
             name
             for name, judged in zip(self.skills, self.own_success, strict=True)
             if not judged and name not in (done or {})
         )
-        return Handover(self.skills, calls, did, cut, by_itself)
+        known = before >= 0
+        calls, did = pair_counts(before, self.skill, won, count, known & ~self.began_late)
+        late, _ = pair_counts(before, self.skill, won, count, known & self.began_late)
+        needed = np.zeros_like(late)
+        for i, j in np.argwhere(late > 0).tolist():
+            rows = self.began_late & (before == i) & (self.skill == j)
+            ends = self.age[rows] + self.whole_steps[self.choice[rows]]
+            needed[i, j] = np.quantile(ends, 0.5, method="higher")
+        limit, steps = self.time_limit, self.steps
+        return Handover(self.skills, calls, did, late, by_itself, limit, needed, steps)
+
+    def _too_late(self, calls: Array) -> str:
+        """Return words on calls (k,) that began too late; empty: there are none."""
+        late = calls[self.began_late[calls]]
+        if not len(late):
+            return ""
+        needed = self.age[late] + self.whole_steps[self.choice[late]]
+        return ": " + began_late_words(
+            len(late), self.time_limit, int(np.quantile(needed, 0.5, method="higher"))
+        )
 
     @checked_names
     def chain(
@@ -490,42 +762,52 @@ class LinkedCalls(CallColumns):
             raise DeclarationError("chain() needs the names of skills: chain('left', 'right')")
         numbers = [self.number(name) for name in skills]
         won = calls_done(self, done)
-        counts = ~self.was_cut | won
-        rows = [np.flatnonzero(counts & (self.skill == number)) for number in numbers]
-        rows[0] = rows[0][self.order[rows[0]] == 0]
-        for name, some in zip(skills, rows, strict=True):
+        every = [np.flatnonzero(self.skill == number) for number in numbers]
+        every[0] = every[0][self.order[every[0]] == 0]
+        rows = [some[~self.began_late[some]] for some in every]
+        for name, some, with_late in zip(skills, rows, every, strict=True):
             if not len(some):
                 where = " at the start of an episode" if some is rows[0] else ""
                 raise RunError(
-                    f"the log has no complete call of {name!r}{where}; record more calls, chosen "
-                    "at random"
+                    f"the log has no call of {name!r}{where} that counts"
+                    + self._too_late(with_late)
+                    + "; record more calls, chosen at random"
                 )
         maps = feature_maps(self, features, np.concatenate([self.start, self.end]))
-        # From the last skill back: the chance that the rest of the chain is done after each call.
-        chance = won[rows[-1]].astype(np.float64)
-        for i in reversed(range(len(skills) - 1)):
+        links = list[tuple[Array, Array]]()
+        for i, (some, following) in enumerate(pairwise(rows)):
             here = maps[numbers[i + 1]]
-            starts, ends = here(self.start[rows[i + 1]]), here(self.end[rows[i]])
-            near, distance = nearest(starts, ends, NEIGHBORS, rows[i + 1])
-            follows = (weights_of(distance) * chance[near]).sum(1)
-            may = self.may_follow[rows[i]].reshape(len(rows[i]), len(self.skills), -1)
-            goes_on = won[rows[i]] & ~self.terminated[rows[i]]
+            starts, ends = here(self.start[following]), here(self.end[some])
+            near, weights = _others(starts, ends, following, self.followed_by[some])
+            may = self.may_follow[some].reshape(len(some), len(self.skills), -1)
+            goes_on = won[some] & ~self.terminated[some]
             follows_on = goes_on & may[:, numbers[i + 1]].any(1)
             if goes_on.any() and not follows_on.any():
                 raise RunError(
                     f"{skills[i + 1]!r} may not start where any logged call of {skills[i]!r} was "
                     "done (its initiation() is False there), so this chain cannot be run"
                 )
-            chance = np.where(follows_on, follows, 0.0)
+            links.append((near, weights * follows_on[:, None]))
+        # Of each call the share of chains that come by it: at a start, then along the links.
+        shares = [np.full(len(rows[0]), 1 / len(rows[0]))]
+        for (near, weights), following in zip(links, rows[1:], strict=True):
+            passed = shares[-1][:, None] * weights
+            shares.append(np.bincount(near.ravel(), passed.ravel(), minlength=len(following)))
+        estimate = float(shares[-1] @ won[rows[-1]])
+        bounds = [
+            _bounds(estimate, share, self.episode[some])
+            for share, some in zip(shares, rows, strict=True)
+        ]
         matrix = self.handover(done)
         pairs = [matrix.of(b, a) for a, b in zip((START, *skills), skills, strict=False)]
         rates = tuple(rate for rate, _ in pairs)
         return Chain(
             tuple(skills),
-            float(chance.mean()),
+            estimate,
             float(np.prod(rates)),
             rates,
             tuple(count for _, count in pairs),
+            (min(low for low, _ in bounds), max(high for _, high in bounds)),
         )
 
     @checked_names
@@ -566,7 +848,7 @@ class LinkedCalls(CallColumns):
         Each call of the second skill after the first is predicted by the nearest other ones. If
         the third of the first skill's ends with the best predictions serve about as well as other
         starts do, and the other ends clearly worse, then the first skill is to blame for how it
-        ends; else the second has never learnt to start there.
+        ends. Else the second one has not learnt to start there; where it works is named.
 
         Args:
             skill: the second skill.
@@ -582,27 +864,35 @@ class LinkedCalls(CallColumns):
         wanted = 0 if after == START else self.number(after) + 1
         won = calls_done(self, done)
         counts = self.skill == number
-        before = before_each(self, won)
+        every = _row_of_each(self, won, only_after_done=True)
+        before = np.where(self.began_late, -1, every)
         rows = np.flatnonzero(counts & (before == wanted))
         if not len(rows):
             raise RunError(
-                f"the log has no call of {skill!r} after a call of {after!r} that was done; record "
-                "more calls, chosen at random"
+                f"the log has no call of {skill!r} after a call of {after!r} that was done"
+                + self._too_late(np.flatnonzero(counts & (every == wanted)))
+                + "; record more calls, chosen at random"
             )
         others = np.flatnonzero(counts & (before >= 0) & (before != wanted))
         nan, did = float("nan"), won[rows]
         elsewhere = float(won[others].mean()) if len(others) else nan
         reasons, rate = self.take(rows[~did]).reasons, float(did.mean())
+        starts = self.flat(self.start)
+        changes = np.ones(starts.shape[1], bool)
+        if after != START:
+            of_first = self.skill[self.owner] == self.number(after)
+            changes = (self.flat(self.before[of_first]) != self.flat(self.next_obs[of_first])).any(
+                0
+            )
+        works, differs = self._works(won, before, number, rows, starts, changes)
         unknown = Blame(
             skill, after, rate, elsewhere, len(rows), len(others), nan, nan, None, (nan, nan),
-            reasons, False,
+            reasons, False, works, differs,
         )  # fmt: skip
         if after == START or len(rows) < LEAST:
             return unknown
         maps = feature_maps(self, features, self.start)
-        known = np.flatnonzero(counts & (~self.was_cut | won))
-        starts, of_first = self.flat(self.start), self.skill[self.owner] == self.number(after)
-        changes = (self.flat(self.before[of_first]) != self.flat(self.next_obs[of_first])).any(0)
+        known = np.flatnonzero(counts & ~self.began_late)
         # Where a number that the first skill does not change decides, none of its ends is better.
         score = _predicted(maps[number](self.start), won, known, rows)
         score = score - _predicted(
@@ -616,4 +906,52 @@ class LinkedCalls(CallColumns):
         _, high = wilson(did[~best].sum(), (~best).sum())
         first = good >= as_elsewhere - LIKE_ELSEWHERE and good - bad >= WORSE and low > high
         place, means = _largest_difference(starts[rows], best, changes)
-        return replace(unknown, best=good, others=bad, place=place, means=means, first=bool(first))
+        low, high = np.quantile(starts[:, changes], (0.05, 0.95), axis=0)
+        alike = starts[rows][:, changes].std(0) <= ALIKE * (high - low)
+        return replace(
+            unknown,
+            best=good,
+            others=bad,
+            place=place,
+            means=means,
+            first=bool(first),
+            alike=bool(changes.any() and alike.all()),
+        )
+
+    def _works(
+        self,
+        won: Array,
+        before: Array,
+        number: int,
+        rows: Array,
+        starts: Array,
+        changes: Array,
+    ) -> tuple[tuple[tuple[str, int, int], ...], tuple[int, float, float] | None]:
+        """Return ``works`` and ``differs`` of a ``Blame``.
+
+        Args:
+            won: (C,) bool, the calls that were done.
+            before: (C,) of ``before_each``.
+            number: of the skill.
+            rows: (n,) its calls that it is to explain.
+            starts: (C, F) flat observations at the starts of all calls.
+            changes: (F,) bool, the numbers that the first skill changes.
+        """
+        high = wilson(won[rows].sum(), len(rows))[1]
+        works, there = list[tuple[str, int, int]](), list[Array]()
+        for row in np.unique(before[(before >= 0) & (self.skill == number)]).tolist():
+            some = np.flatnonzero((before == row) & (self.skill == number))
+            done = won[some].sum()
+            if wilson(done, len(some))[0] > high:
+                works.append(((START, *self.skills)[row], int(done), len(some)))
+                there.append(some[won[some]])
+        works.sort(key=lambda entry: -entry[1] / entry[2])
+        if not works:
+            return (), None
+        both = np.concatenate([*there, rows])
+        place, (one, other) = _largest_difference(
+            starts[both], np.arange(len(both)) < len(both) - len(rows), changes
+        )
+        if place is None or np.isclose(one, other):
+            return tuple(works), None
+        return tuple(works), (place, one, other)

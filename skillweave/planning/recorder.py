@@ -119,6 +119,8 @@ class Recorder:
         """The goals of skills that have some, by name."""
         self.endless = np.array([is_endless(skills, i) for i in range(len(skills.skills))], bool)
         """(S,) bool, with ``own_rewards`` their ``success`` is asked in each step, for ``late``."""
+        self.limits = tuple(skills.limit(i) for i in range(len(skills.skills)))
+        """Of each skill, the most steps of a call; None: it has no limit."""
         self.steps = 0
         """Steps that are kept."""
         self._bytes = 0  # of all steps so far
@@ -248,6 +250,7 @@ class Recorder:
             *self.spaces,
             **fields_of(columns),
             code=self._environment | skill_code(skills),
+            limits=self.limits,
         )
         return log if self.latest is None else log.latest(self.latest)
 

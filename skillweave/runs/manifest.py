@@ -194,9 +194,13 @@ class Matrix:
     skills: list[str]
     calls: list[list[Count]]
     done: list[list[Count]]
-    cut: list[Count]
+    began_late: list[list[Count]]
+    """Calls that are left out, as they began too late."""
     by_itself: list[str]
     """Skills whose calls were done if they ended by themselves."""
+    time_limit: Count = 0
+    needed: list[list[Count]] | None = None
+    """Steps of an episode in which half of the calls that began too late would have counted."""
 
 
 @dataclass

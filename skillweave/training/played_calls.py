@@ -130,8 +130,11 @@ class PlayedCalls:
             seeds: of the episodes, in order.
         """
         logs = {path: recorder.log() for path, recorder in self.recorders().items()}
-        by_episode = np.array(seeds, np.int64)
-        return {path: replace(log, seed=by_episode[log.episode]) for path, log in logs.items()}
+        by_episode, limit = np.array(seeds, np.int64), logs[""].time_limit
+        return {
+            path: replace(log, seed=by_episode[log.episode], known_time_limit=limit)
+            for path, log in logs.items()
+        }
 
     def _recorders(self, num_envs: int) -> dict[str, Recorder]:
         recorders = {
@@ -140,6 +143,7 @@ class PlayedCalls:
         }
         if self.alone is not None:
             recorders[""].endless[:] = False
+            recorders[""].limits = (self.alone.max_steps,)
         return recorders
 
     def _calls(self, path: str, played: Played) -> Memory:

@@ -10,8 +10,14 @@ import numpy as np
 
 from skillweave._internal.messages import aligned
 from skillweave._internal.paths import join, level_of
-from skillweave.planning.columns import ENDS
-from skillweave.planning.handover import Handover, pair_counts
+from skillweave.planning.columns import (
+    ENDS,
+    began_late,
+    limits_of_choices,
+    time_limit_of,
+    whole_steps,
+)
+from skillweave.planning.handover import LEAST, Handover, pair_counts
 from skillweave.planning.recorder import Recorder
 from skillweave.policies.core import CallEnd
 from skillweave.schema import Count
@@ -63,6 +69,16 @@ class SkillReport:
     """It was trained; False: its policy was given, so no reward changes what it does."""
     has_goals: bool = field(default=False, compare=False)
     """Its calls have goals, which initiation() does not see."""
+    began_late: Count = field(default=0, compare=False)
+    """Calls that began too late to run their whole length before the episode's time limit: they do
+    not count in ``success_rate``."""
+    began_late_succeeded: Count = field(default=0, compare=False)
+    """Those of them that succeeded."""
+
+    @property
+    def counted(self) -> int:
+        """The calls that began early enough to run their whole length."""
+        return self.calls - self.began_late
 
     @property
     def length_mean(self) -> float | None:
@@ -71,8 +87,10 @@ class SkillReport:
 
     @property
     def success_rate(self) -> float | None:
-        """Share of its calls that succeeded; None: no calls, or the skill defines no success."""
-        return None if self.succeeded is None or not self.calls else self.succeeded / self.calls
+        """Share of ``counted`` that succeeded; None: no calls, or the skill defines no success."""
+        if self.succeeded is None or not self.counted:
+            return None
+        return (self.succeeded - self.began_late_succeeded) / self.counted
 
     @property
     def return_mean(self) -> float | None:
@@ -99,12 +117,16 @@ def skill_reports(calls: PlayedCalls) -> dict[str, SkillReport]:
         calls: with the skills' own rewards.
     """
     found: dict[str, SkillReport] = {}
-    for recorder in calls.recorders().values():
-        found |= _level_reports(calls, recorder)
+    recorders = calls.recorders()
+    limit = _time_limit(recorders[""].rows())
+    for recorder in recorders.values():
+        found |= _level_reports(calls, recorder, limit)
     return {name: found[name] for path in calls.skills() if (name := join(calls.prefix, path))}
 
 
-def _level_reports(calls: PlayedCalls, recorder: Recorder) -> dict[str, SkillReport]:
+def _level_reports(
+    calls: PlayedCalls, recorder: Recorder, time_limit: int
+) -> dict[str, SkillReport]:
     """Return the reports of the skills of one level, by their paths."""
     rows, skill, before = _with_before(recorder)
     skills, alone = recorder.skills.skills, calls.alone is not None and not recorder.path
@@ -115,6 +137,7 @@ def _level_reports(calls: PlayedCalls, recorder: Recorder) -> dict[str, SkillRep
     last = np.roll(rows, 1)
     again = (before == skill + 1) & np.roll(own, 1)
     again &= last["age"] + last["steps"] == rows["age"]
+    late = _began_late(recorder, rows, time_limit)
     hasty = own & ~over & (rows["steps"] <= 2) & pays[skill] & (rows["last_reward"] < 0) & ~won
     which = {
         "calls": np.ones(len(rows), bool),
@@ -124,6 +147,8 @@ def _level_reports(calls: PlayedCalls, recorder: Recorder) -> dict[str, SkillRep
         "hasty": hasty & (not alone),
         "own_with_episode": own & over,
         "succeeded": won,
+        "began_late": late,
+        "began_late_succeeded": late & won,
         **{name: rows["end_reason"] == why for why, name in ENDS.items()},
     }
     counts = {k: np.bincount(skill[of], minlength=len(skills)).tolist() for k, of in which.items()}
@@ -153,16 +178,33 @@ def weak_handovers(calls: PlayedCalls) -> list[str]:
 
     Skills without ``success`` are left out.
     """
-    sentences = []
-    for recorder in calls.recorders().values():
+    sentences, recorders = [], calls.recorders()
+    limit = _time_limit(recorders[""].rows())
+    for recorder in recorders.values():
         rows, skill, before = _with_before(recorder)
         names, won = _paths(calls, recorder), rows["succeeded"]
-        cut = (rows["end_reason"] == CallEnd.EPISODE) & ~rows["terminated"] & ~won
         judged = np.array([s.defines("success") for s in recorder.skills.skills])
-        counts = judged[skill] & ~cut & ((before == 0) | np.roll(won, 1))
-        pairs = pair_counts(before[counts], skill[counts], won[counts], len(names))
-        sentences += Handover(names, *pairs, np.zeros(len(names), np.int64)).weakest()
+        follows = judged[skill] & ((before == 0) | np.roll(won, 1))
+        late = _began_late(recorder, rows, limit)
+        pairs = pair_counts(before, skill, won, len(names), follows & ~late)
+        none = np.zeros_like(pairs[0])
+        sentences += Handover(names, *pairs, none, time_limit=limit).weak_sentences(LEAST)
     return sentences
+
+
+def _time_limit(rows: Array) -> int:
+    """Return the steps after which a time limit ended episodes, by the outermost calls; 0: none."""
+    cut = rows["truncated"] & ~rows["terminated"]
+    return time_limit_of(rows["age"] + rows["steps"], cut)
+
+
+def _began_late(recorder: Recorder, rows: Array, time_limit: int) -> Array:
+    """Return the calls of a level that began too late to count, (C,) bool."""
+    complete = (rows["end_reason"] == CallEnd.OWN) | rows["terminated"]
+    was_cut = (rows["end_reason"] == CallEnd.EPISODE) & rows["truncated"] & ~rows["terminated"]
+    limits = limits_of_choices(recorder.skills, recorder.limits)
+    whole = whole_steps(rows["choice"], rows["steps"], complete, was_cut, limits)
+    return began_late(rows["age"], whole[rows["choice"]], time_limit)
 
 
 def _with_before(recorder: Recorder) -> tuple[Array, Array, Array]:

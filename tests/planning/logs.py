@@ -16,7 +16,7 @@ WHY = {"own": CallEnd.OWN, "limit": CallEnd.LIMIT, "end": CallEnd.EPISODE, "cut"
 
 def log_of(
     skills: Sequence[str], episodes: Sequence[Any], size: int = 1, lengths: Sequence[int] = (),
-    rewards = None
+    rewards = None, limits: Sequence[int | None] = (),
 ) -> CallLog:  # fmt: skip
     """A log of episodes (first observation, [(choice, [observations inside], won, why), …]).
 
@@ -55,4 +55,5 @@ def log_of(
         next_obs=np.array(inside, np.float32).reshape(-1, size),
         action=np.zeros(len(inside), np.int64),
         reward=np.zeros(len(inside), np.float32) if rewards is None else np.float32(rewards),
+        limits=tuple(limits),
     )

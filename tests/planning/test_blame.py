@@ -41,8 +41,56 @@ def test_the_second_must_learn_where_no_end_would_do():
     found = log("never").blame("b", "a")
     assert not found.first
     assert (found.rate, found.calls) == (0.0, 120)
-    assert "It would not help if 'a' ended elsewhere" in str(found)
+    assert "From the best third of the ends of 'a' it is done in 0% of 40 calls" in str(found)
+    # It works from 5, where no call of "a" ends.
+    assert found.works == (("start", 120, 120),)
+    assert found.differs == (0, 5.0, pytest.approx(0.5, abs=0.1))
+    assert "'b' works at the start of an episode (100% of 120 calls (97% to 100%)), where" in (
+        str(found)
+    )
+    assert "So 'a' has to end as these do, another skill has to come in between, or" in str(found)
+    assert "So they may need more steps (call_steps, max_steps)" in str(found)
+
+
+def test_without_another_start_the_second_skill_has_to_work_from_there():
+    every = log("never")
+    after = every.take(np.flatnonzero((every.start[:, 0] < 5) | (every.skill == A)))
+    found = after.blame("b", "a")
+    assert (found.works, found.differs, found.calls_elsewhere) == ((), None, 0)
     assert str(found).endswith("So 'b' itself has to work from there.")
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 0.3])
+def test_ends_that_are_alike_do_not_say_whether_others_would_do(noise):
+    """``a`` always ends at 1, where ``b`` fails; it works after ``c``, which ends at 0."""
+    rng, episodes = np.random.default_rng(0), []
+    for i in range(120):
+        end = 1.0 + noise * float(rng.random()) if i % 2 else 0.0
+        won = not i % 2
+        b = (B, [end], won, "own" if won else "end")
+        episodes.append((0.5, [(A if i % 2 else 2, [end], True, "own"), b]))
+    found = log_of(["a", "b", "c"], episodes).blame("b", "a")
+    assert found.alike == (noise < 0.1)
+    assert ("All ends of 'a' are alike" in str(found)) == found.alike
+    assert found.works == (("c", 60, 60),)
+    assert "after 'c' (100% of 60 calls (94% to 100%)), where number 0 of the observation is 0" in (
+        str(found)
+    )
+    assert "would not help" not in str(found)
+    assert "more steps" not in str(found)
+
+
+def test_what_the_first_skill_does_not_change_is_no_reason_to_end_elsewhere():
+    """``b`` works with a key, which ``a`` cannot get: number 1 alone decides."""
+    episodes = []
+    for i in range(120):
+        key, won = float(i % 2), bool(i % 2)
+        b = (B, [[1.0, key]], won, "own" if won else "limit")
+        episodes.append(([0.0, key], [(A if not won else 2, [[1.0, key]], True, "own"), b]))
+    found = log_of(["a", "b", "c"], episodes, size=2).blame("b", "a")
+    assert found.works == (("c", 60, 60),)
+    assert found.differs is None
+    assert "So another skill has to come in between" in str(found)
 
 
 @pytest.mark.parametrize(
@@ -83,6 +131,7 @@ def test_few_calls_do_not_tell():
     found = log("never", 8).blame("b", "a")
     assert np.isnan(found.best)
     assert "too few calls to say which skill is to blame" in str(found)
+    assert "'b' works at the start of an episode (100% of 8 calls" in str(found)
 
 
 def test_a_pair_without_a_call_is_said():

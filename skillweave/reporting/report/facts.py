@@ -377,11 +377,12 @@ def _skills(skills: Mapping[str, SkillReport], total: int) -> list[str]:
 
 def _failing(name: str, report: SkillReport) -> str:
     """Return a sentence on a skill that seldom succeeds."""
+    calls = report.counted
     if report.calls == 1:
         return f"`{name}` does not succeed in its only call"
     if not report.succeeded:
         return f"`{name}` succeeds in none of its {report.calls:,} calls"
-    return f"`{name}` succeeds in only {percent(report.success_rate)} of its {report.calls:,} calls"
+    return f"`{name}` succeeds in only {percent(report.success_rate)} of its {calls:,} calls"
 
 
 def _listed(names: Sequence[str]) -> str:

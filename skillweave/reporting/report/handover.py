@@ -123,7 +123,7 @@ def _words(
         "weak": any(cell["weak"] for cell in shown.values()),
         "calls": f"{len(log):,}",
         "steps": f"{log.steps:,}",
-        "cut": f"{int(matrix.cut.sum()):,}" if matrix.cut.any() else "",
+        "left_out": matrix.left_out,
         "ends": [_end_row(log.call_ends(name)) for name in called],
         "called": called,
         "where": _where_rows(log, called, named),
