@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -277,6 +277,25 @@ def forecast(planner: Planner) -> Forecast:
         goals,
         planner.already,
     )
+
+
+def played(expected: Forecast, done: int | None, episodes: int, steps: float) -> Forecast:
+    """Return a forecast with what played episodes did in place of what was expected.
+
+    Args:
+        expected: before they were played.
+        done: the episodes that succeeded; None: the task has no accepting state.
+        episodes: how many were played.
+        steps: their mean steps.
+    """
+    share, interval = None, (0.0, 1.0)
+    if done is not None:
+        low, high = wilson(done, episodes)
+        share, interval = done / episodes, (float(low), float(high))
+    return replace(
+        expected, chance=share, interval=interval, steps=steps, unsure=(), reason="",
+        episodes=episodes,
+    )  # fmt: skip
 
 
 def _without_luck(

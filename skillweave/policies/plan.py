@@ -181,7 +181,7 @@ class OptionGroup:
         known = np.isfinite(off).sum(1, keepdims=True)
         own = each * np.maximum(known, self.options) // self.options
         goal = np.where(own < known, np.take_along_axis(self.goal[near], own, 1), -1)
-        for some in _blocks(n, self.options * POOL):
+        for some in _blocks(n, self.options * POOL * max(1, aims.shape[1])):
             goals, mine = aims[self.call[near[some]]], own[some, :, None]
             apart = np.square(np.take_along_axis(goals, mine, 1)[:, :, None] - goals[:, None]).sum(3)
             apart += np.square(off[some, None])  # (n, options, calls)

@@ -140,7 +140,10 @@ class Planned(Rule):
         """
         features, each = [own(obs) for own in self.features], np.arange(len(rows))
         tried = memory["tried"]
-        near, corners = self.options.near(features), self.levels.corners(_state(memory, rows))
+        near, corners = (
+            self.options.near(features),
+            self.levels.corners(self.state_of(memory, rows)),
+        )
         may = turn.mask
         may = np.ones((len(rows), self.count), bool) if may is None else may
         now = {
@@ -182,7 +185,7 @@ class Planned(Rule):
 
     def follow(self, memory: Memory, rows: Array, read: Readings, last: LastCall) -> None:
         """Do what ``watch`` does, with what the task has read of the step."""
-        after, reward = self.task.advance(_state(memory, rows), read)
+        after, reward = self.task.advance(self.state_of(memory, rows), read)
         memory["state"][rows], memory["counters"][rows] = after[:, 0], after[:, 1:]
         tried = memory["tried"]
         latest = rows, (tried["count"][rows] - 1) % LATEST
@@ -206,6 +209,10 @@ class Planned(Rule):
         length = np.where(other | (last.why == LIMIT), at, choice % count)
         called: Array = last.skill * count + np.minimum(length, count - 1)
         return called
+
+    def state_of(self, memory: Memory, rows: Array) -> Array:
+        """Return the task's state in a memory, (k, 1 + H)."""
+        return np.concatenate([memory["state"][rows, None], memory["counters"][rows]], 1)
 
     # Values
 
@@ -335,11 +342,6 @@ class Planned(Rule):
         same = (ends["to"][:, :, None] == calls["from"][:, None]) & (choice >= 0)[:, None]
         of = choice[:, None, :, None] == self.options.choice_of
         return far, same[..., None] & of & (far <= ends["far"][:, :, None] + SLACK)
-
-
-def _state(memory: Memory, rows: Array) -> Array:
-    """Return the task's state in a memory, (k, 1 + H)."""
-    return np.concatenate([memory["state"][rows, None], memory["counters"][rows]], 1)
 
 
 def _best(q: Array, may: Array) -> Array:
