@@ -38,7 +38,11 @@ HELD_OUT = 0.632
 FEWEST_EPISODES = 4
 """Episodes of a log from which on its halves judge one another."""
 FOLLOWED = 5
-"""The nearest calls, of which one is followed."""
+"""The nearest calls, of which one is followed; more where others are as near as the last."""
+EQUAL = 10
+"""Times as many are looked at."""
+SAME = 1e-3
+"""Distances that differ by less are equal."""
 MOST_CALLS = 100
 """The most calls of an episode."""
 UNLIKELY = 0.2
@@ -218,12 +222,13 @@ class _Calls:
         if not len(rows):
             return np.full(len(obs), -1)
         calls = self._graph.pieces.call[rows]
-        near, far = nearest(points, self._points(choice, obs, aim), FOLLOWED + 1, calls)
+        near, far = nearest(points, self._points(choice, obs, aim), EQUAL * FOLLOWED, calls)
         far[calls[near] == aim[:, None]] = np.inf
-        order = far.argsort(axis=1, kind="stable")[:, :FOLLOWED]
+        order = far.argsort(axis=1, kind="stable")
         near, far = (np.take_along_axis(x, order, 1) for x in (near, far))
-        counts = far <= FAR * np.maximum(far[:, :1], usual)
-        weights = np.where(counts & np.isfinite(far), 1.0 / (far + SOFT), 0.0)
+        counts = (far <= far[:, FOLLOWED - 1, None] + SAME) & np.isfinite(far)
+        counts &= far <= FAR * np.maximum(far[:, :1], usual)
+        weights = np.where(counts, 1.0 / (far + SOFT), 0.0)
         drawn = weights.cumsum(1) < rng.random((len(obs), 1)) * weights.sum(1, keepdims=True)
         place = np.minimum(drawn.sum(1), near.shape[1] - 1)
         piece = rows[near[np.arange(len(obs)), place]]

@@ -27,7 +27,6 @@ from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbors import Standard, evenly, tie_order
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import (
-    JUDGES,
     MOST_COUNTERS,
     Levels,
     Near,
@@ -161,9 +160,9 @@ class CallGraph:
             self.may[parts] = skills.hierarchy.may_start(self.end[parts])
         self._end_features = [features(self.end) for features in self.maps]
 
-    def near(self, obs: Array, most: int = 0) -> Near:
-        """Return the nearest pieces of each choice to observations (n, …): K, or ``most``."""
-        return self.options.near([each(obs) for each in self.maps], most)
+    def near(self, obs: Array) -> Near:
+        """Return the nearest pieces of each choice to observations (n, …)."""
+        return self.options.near([each(obs) for each in self.maps])
 
     def _groups(self, starts: Array, aims: list[Array | None]) -> Iterator[OptionGroup]:
         """Yield the options of all choices, by groups that share their calls.
@@ -192,8 +191,7 @@ class CallGraph:
                 )
                 if len(alike):
                     some = evenly(alike, SAMPLED)
-                    k = max(self.neighbors, JUDGES) if count > 1 else self.neighbors
-                    far = group.near(features[some], k, own, call[some])[1]
+                    far = group.near(features[some], self.neighbors, own, call[some])[1]
                     group.usual = float(np.median(far[:, :, -1]))
                 yield group
 

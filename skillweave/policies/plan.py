@@ -35,7 +35,10 @@ and by which these are judged."""
 POOL_AHEAD = 4
 """As ``AHEAD``, of a pool: the pool may be of somewhat fewer calls."""
 JUDGES = 15
-"""The fewest calls that judge a goal: by fewer, the best of many goals would be the luckiest."""
+"""The calls that judge a goal, its own left out: by fewer, the best of many goals would be the
+luckiest."""
+FOR_EACH = 8
+"""Calls of a group for each one that judges: where it has few, so many would be far away."""
 MOST_OPTIONS = 10_000
 MOST_COUNTERS = 4
 
@@ -151,6 +154,7 @@ class OptionGroup:
         for name in ("rows", "call", "goal"):
             check(name, getattr(self, name), "iu", (len(self.starts),), -1 if name == "goal" else 0)
         self._squares = np.square(self.starts).sum(-1)
+        self._judges = min(JUDGES, len(np.unique(self.call)) // FOR_EACH)
 
     def near(
         self, to: Array, k: int, aims: Array | None, without: Array | None = None
@@ -158,40 +162,42 @@ class OptionGroup:
         """Return the nearest pieces to features ``to`` (n, F), however far they are.
 
         Args:
-            k: how many, each of another call.
+            k: the fewest, each of another call; goals are judged by more where there are enough.
             aims: (C, G) float32, the standardised goals of all calls; None: it has no goals.
             without: (n,) calls whose pieces do not count; None: all count.
 
         Returns:
-            Pieces (n, options, k), distances (n, options, k), infinite where there are fewer; and
+            Pieces (n, options, K), distances (n, options, K), infinite where there are fewer; and
             the calls whose goals the options have, (n, options), −1: none.
         """
-        n = len(to)
-        pieces = np.zeros((n, self.options, k), np.int64)
+        n, several = len(to), self.options > 1
+        judges = max(k, self._judges) if several else k
+        pieces = np.zeros((n, self.options, judges), np.int64)
         far = np.full(pieces.shape, np.inf, np.float32)
         if not len(self.rows):
             return pieces, far, np.full(far.shape[:2], -1)
-        near, off = self._nearest(to, k if self.options == 1 else POOL, without)
-        if self.options == 1:
+        near, off = self._nearest(to, POOL if several else k, without)
+        if not several:
             pieces[:, 0], far[:, 0] = self.rows[near], off
             return pieces, far, np.where(np.isfinite(off), self.goal[near], -1)[:, :1]
         assert aims is not None
-        # Of every so-many-th call by start the goal is an option; all judge it but its own call.
-        each = np.arange(self.options)
+        # Of every so-many-th call by start the goal is an option.
         known = np.isfinite(off).sum(1, keepdims=True)
-        own = each * np.maximum(known, self.options) // self.options
+        own = np.arange(self.options) * np.maximum(known, self.options) // self.options
         goal = np.where(own < known, np.take_along_axis(self.goal[near], own, 1), -1)
         for some in _blocks(n, self.options * POOL * max(1, aims.shape[1])):
             goals, mine = aims[self.call[near[some]]], own[some, :, None]
-            apart = np.square(np.take_along_axis(goals, mine, 1)[:, :, None] - goals[:, None]).sum(3)
-            apart += np.square(off[some, None])  # (n, options, calls)
-            np.put_along_axis(apart, mine, np.inf, 2)
-            least = apart.argpartition(k - 1, axis=2)[:, :, :k]
-            both = np.take_along_axis(apart, least, 2)
+            wanted = np.take_along_axis(goals, mine, 1)
+            both = np.square(wanted[:, :, None] - goals[:, None]).sum(3)
+            both += np.square(off[some, None])  # (n, options, calls)
+            if judges > k:  # few calls cannot do without
+                np.put_along_axis(both, mine, np.inf, 2)
+            least = both.argpartition(judges - 1, axis=2)[:, :, :judges]
+            both = np.take_along_axis(both, least, 2)
             order = both.argsort(axis=2, kind="stable")
             far[some] = np.sqrt(np.take_along_axis(both, order, 2))
-            judges = np.take_along_axis(least, order, 2)
-            pieces[some] = self.rows[np.take_along_axis(near[some, None], judges, 2)]
+            least = np.take_along_axis(least, order, 2)
+            pieces[some] = self.rows[np.take_along_axis(near[some, None], least, 2)]
         far[goal < 0] = np.inf
         return pieces, far, goal
 
@@ -222,9 +228,6 @@ class Options:
         each = max(1, len(self.lengths))
         self.choices = len(self.aims) * each
         of = [group.choice for group in self.groups]
-        several = any(group.options > 1 for group in self.groups)
-        self.judges = max(self.neighbors, JUDGES) if several else self.neighbors
-        """The most calls that judge an option."""
         rising = list(self.lengths) == sorted(set(self.lengths))
         whole = of and of == sorted(of) and {*of} == {*range(self.choices)}
         if not whole or not rising or self.neighbors < 1:
@@ -267,23 +270,23 @@ class Options:
             groups.append(replace(group, **columns))
         return replace(self, groups=tuple(groups))
 
-    def near(self, features: Sequence[Array], most: int = 0, without: Array | None = None) -> Near:
+    def near(self, features: Sequence[Array], without: Array | None = None) -> Near:
         """Return the nearest pieces of each option to features of each skill, (n, F) each.
 
         Args:
-            most: how many, each of another call; 0: K.
             without: (n,) calls whose pieces do not count; None: all count.
         """
         found = []
         for group in self.groups:
             skill = self.skill_of[group.choice]
             to, aims = features[skill], self.aims[skill]
-            pieces, far, goal = group.near(to, most or self.judges, aims, without)
-            if group.options == 1 and not most:
-                far[..., self.neighbors :] = np.inf
+            pieces, far, goal = group.near(to, self.neighbors, aims, without)
             limit = FURTHER * np.maximum(far[..., :1], np.float32(group.usual))
             found.append((pieces, np.where(far <= limit, far, np.float32(np.inf)), goal))
-        pieces, distance, goal = (np.concatenate(part, 1) for part in zip(*found, strict=True))
+        most = max(pieces.shape[2] for pieces, _, _ in found)
+        pieces = np.concatenate([_wide(each, most, 0) for each, _, _ in found], 1)
+        distance = np.concatenate([_wide(each, most, np.inf) for _, each, _ in found], 1)
+        goal = np.concatenate([each for _, _, each in found], 1)
         finite = np.where(np.isfinite(distance), distance, 1e9)
         total = (1.0 / (finite + SOFT)).sum(2)
         return Near(pieces, weights_of(finite), distance[:, :, 0], total, goal)
@@ -299,6 +302,12 @@ class Options:
         far = np.where(np.isfinite(distance), distance, 0.0) / self.units
         share: Array = (1.0 / (1.0 + caution * far)).astype(np.float32)
         return share
+
+
+def _wide(x: Array, most: int, empty: float) -> Array:
+    """Return an array (n, options, k) as (n, options, most), with ``empty`` at the end."""
+    width = ((0, 0), (0, 0), (0, most - x.shape[2]))
+    return np.pad(x, width, constant_values=empty)
 
 
 def nearest(
