@@ -139,7 +139,7 @@ def lucky(share: float, seed: int, calls: int = 400) -> CallLog:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_luckiest_of_many_goals_promises_no_more_than_others(share, seed):
     expected = forecast(Planner(lucky(share, seed), Mission(at(5))))
-    assert expected.chance == pytest.approx(share, abs=0.2)
+    assert share - 0.15 < expected.chance < share + 0.25
     assert expected.interval[0] <= share <= expected.interval[1]
 
 
@@ -186,7 +186,7 @@ def test_calls_that_began_too_late_are_no_evidence():
         (Mission(at(2), avoid=NINE), []),
         (Mission(held(NOT_NINE, 3), at(2)), []),
         (Mission(at(0) & at(1), at(2)), []),
-        (Mission(at(1), repeat=None), []),
+        (Mission(at(1), at(2), repeat=None), []),
     ],
 )
 def test_words_that_hold_before_anything_is_done_are_said(task, words):
