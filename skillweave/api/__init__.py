@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Literal
 
 from skillweave._internal.arguments import checked_names
@@ -64,7 +65,7 @@ from skillweave.hierarchy.weights import (
     write_weights,
 )
 from skillweave.planning import CallLog, Handover, Planner
-from skillweave.planning.forecast import Forecast, forecast
+from skillweave.planning.forecast import Forecast, forecast, played
 from skillweave.planning.record import with_returns
 from skillweave.planning.run_log import handover_json, handover_of
 from skillweave.reporting.palette import RGB, color_of
@@ -76,7 +77,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.runs.manifest import LevelEntry, manifest_in
 from skillweave.runs.trackers import track_film
-from skillweave.schema import AtLeastOne, as_json, fitted
+from skillweave.schema import AtLeastOne, Count, as_json, fitted
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
@@ -619,8 +620,11 @@ class TrainedPolicy:
         hierarchy, policy = planned(declared, self.policy, planner)
         run = PlannedRun(hierarchy, self.path, policy)
         # Each goal of its own would need a plan of its own now.
+        if planner.already:
+            notice(planner.already)
         if planner.plan.size and (expected := run.explain()).reason:
-            notice(f"this plan has a chance of {expected.chance:.0%}: {expected.reason}")
+            share = "unknown" if expected.chance is None else f"{expected.chance:.0%}"
+            notice(f"this plan has a chance of {share}: {expected.reason}")
         return run
 
     def _own_spec(self) -> EnvSpec:
@@ -846,10 +850,15 @@ class PlannedRun(TrainedPolicy):
         declared._starts = partial(start_of, planner, self.policy, declared.spec, config)
         return declared
 
-    def explain(self) -> Forecast:
-        """Return the calls that the plan intends, its chance and its steps, before it is played.
+    @checked_names
+    def explain(self, *, episodes: int = 0) -> Forecast:
+        """Return the calls that the plan intends, its chance and its steps.
 
-        Printed, it is a line. Episodes are simulated along the logged calls.
+        Printed, it is a line. Before the plan is played, episodes are simulated along the logged
+        calls.
+
+        Args:
+            episodes: are played, where that may be done, and chance and steps are theirs; 0: none.
 
         Raises:
             RunError: the log has no start of an episode.
@@ -858,7 +867,10 @@ class PlannedRun(TrainedPolicy):
         assert isinstance(planner, Planner)
         if self._forecast is None:
             self._forecast = forecast(planner)
-        return self._forecast
+        if not fitted(Count, episodes, "explain(): episodes"):
+            return self._forecast
+        found = self.evaluate(episodes, quiet=True)
+        return played(self._forecast, found.succeeded, episodes, fmean(found.lengths))
 
     def _own_spec(self) -> EnvSpec:
         return untasked(self.hierarchy.spec)

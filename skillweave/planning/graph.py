@@ -161,9 +161,9 @@ class CallGraph:
             self.may[parts] = skills.hierarchy.may_start(self.end[parts])
         self._end_features = [features(self.end) for features in self.maps]
 
-    def near(self, obs: Array, most: int = 0) -> Near:
-        """Return the nearest pieces of each choice to observations (n, …): K, or ``most``."""
-        return self.options.near([each(obs) for each in self.maps], most)
+    def near(self, obs: Array) -> Near:
+        """Return the nearest pieces of each choice to observations (n, …)."""
+        return self.options.near([each(obs) for each in self.maps])
 
     def _groups(self, starts: Array, aims: list[Array | None]) -> Iterator[OptionGroup]:
         """Yield the options of all choices, by groups that share their calls.
@@ -181,7 +181,7 @@ class CallGraph:
             if own is not None and len(rows):
                 _, one, which = np.unique(own[call], axis=0, return_index=True, return_inverse=True)
                 one, which = call[one], which.reshape(-1)
-                if len(one) > MOST_APART or 2 * len(one) > len(np.unique(call)):
+                if not are_apart(len(one), len(np.unique(call))):
                     one, which, count = np.array([-1]), np.zeros_like(which), CANDIDATES
             for i, goal in enumerate(one):
                 alike = np.flatnonzero(which == i)
@@ -264,7 +264,7 @@ class CallGraph:
             best = np.full_like(value, -np.inf)
             for c in options:
                 q = np.zeros_like(best)
-                for k in range(self.neighbors):
+                for k in range(near.pieces.shape[2]):
                     q += near.weights[:, c, k, None] * worth[near.pieces[:, c, k]]
                 q = np.where(q > 0, q * trust[:, c, None], q)
                 if novel is not None:
@@ -326,14 +326,25 @@ class CallGraph:
         return (self.after if same else self.options.near(features)), may
 
 
+def are_apart(goals: int, calls: int) -> bool:
+    """Return whether each of so many goals of calls is as another skill would be."""
+    return goals <= MOST_APART and 2 * goals <= calls
+
+
+def goal_standard(log: CallLog, skill: str) -> Standard | None:
+    """Return the scale of a skill's goals by its calls; None: it has no goals, or no call."""
+    goals, mine = log.goals.get(skill), log.skill == log.number(skill)
+    return None if goals is None or not mine.any() else Standard(goals[mine])
+
+
 def _standard_goals(log: CallLog, skill: str) -> Array | None:
     """Return the goals of all calls, standardised by those of a skill's calls, (C, G) float32."""
     goals, mine = log.goals.get(skill), log.skill == log.number(skill)
     if goals is None:
         return None
-    if not mine.any():
+    if (standard := goal_standard(log, skill)) is None:
         return np.zeros(goals.shape, np.float32)
-    return np.where(mine[:, None], Standard(goals[mine])(goals), 0.0).astype(np.float32)
+    return np.where(mine[:, None], standard(goals), 0.0).astype(np.float32)
 
 
 def _pieces(log: CallLog, skills: SkillSet | None) -> Pieces:

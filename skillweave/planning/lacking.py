@@ -17,6 +17,10 @@ from skillweave.types import Array
 
 TRIES = 20_000
 """Observations that are made up, to find one in which a predicate holds."""
+MOSTLY = 0.5
+"""The share of starts from which on a task is said to be done there already."""
+NEARLY_ALWAYS = 0.99
+"""The share of steps from which on an event is said to hold always."""
 MOST_PLACES = 1_000_000
 """The most pairs of a task's state and what holds, that are searched for a way."""
 
@@ -107,6 +111,79 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
     if avoided := names_of(a for a in arrows if task.failing[a.target]):
         text += f", unless {avoided} holds first, which is avoided"
     return text
+
+
+def asks_nothing(task: RewardMachine, log: CallColumns) -> str:
+    """Return which words of a task hold before anything is done, in a sentence; empty: it asks.
+
+    A task asks for nothing if most logged episodes do it in the fewest steps in which it can be
+    done, whatever skill acts. An event that holds in nearly all logged steps asks for nothing
+    either. One that must hold for several steps, and one that is avoided, are no such events.
+    """
+    events = read_log(task, log).events
+    step = log.offset[:-1][log.order == 0]
+    fewest = _fewest_steps(task)
+    if not len(step) or not fewest:
+        return ""
+    state, going, last = task.start(len(step)), np.ones(len(step), bool), log.offset[1:] - 1
+    held: dict[str, float] = {}
+    for _ in range(fewest):
+        for arrow in {a for q in np.unique(state[going, 0]) for a in task.leaving[int(q)]}:
+            mine = going & (state[:, 0] == arrow.origin) & ~task.failing[arrow.target]
+            for predicate in predicates_of(arrow) if mine.any() else ():
+                share = float(events[step[mine], task.number(predicate)].mean())
+                if share > MOSTLY:
+                    held.setdefault(predicate.name, share)
+        state[going] = task.acts.advance(
+            state[going],
+            Readings(events[step[going]], np.zeros((int(going.sum()), len(task.acts.rewards) + 1))),
+        )[0]
+        owner = log.owner[step]
+        follows = log.followed_by[owner]
+        ends = step == last[owner]
+        going &= ~(ends & (follows < 0))
+        step = np.where(
+            ends, log.offset[np.maximum(follows, 0)], np.minimum(step + 1, log.steps - 1)
+        )
+    done = float(task.has_succeeded(state).mean())
+    if done > MOSTLY and held:
+        return (
+            f"{_joined(held)} hold{'s' * (len(held) == 1)} already in {done:.0%} of the logged "
+            "starts, so the mission asks for nothing there: it is done whatever a skill does"
+        )
+    idle = [
+        predicate.name
+        for predicate in {p.name: p for a in task.arrows if not task.failing[a.target]
+                          for p in _momentary(a)}.values()
+        if events[:, task.number(predicate)].mean() > NEARLY_ALWAYS
+    ]  # fmt: skip
+    if not idle or not task.accepting.any():
+        return ""
+    return (
+        f"{_joined(idle)} hold{'s' * (len(idle) == 1)} in nearly all logged steps, so the mission "
+        "asks for nothing there"
+    )
+
+
+def _momentary(arrow: Arrow) -> list[Predicate]:
+    """Return an arrow's predicates that need not hold for several steps."""
+    return [event for event in arrow.events if isinstance(event, Predicate)]
+
+
+def _fewest_steps(task: RewardMachine) -> int:
+    """Return the fewest steps in which a task can be done, one for each transition; 0: never."""
+    steps, reached = 0, {task.acts.first}
+    while not task.accepting[list(reached)].any():
+        further = {a.target for q in reached for a in task.leaving[q] if not task.failing[a.target]}
+        if further <= reached:
+            return 0
+        reached |= further
+        steps += 1
+    return steps
+
+
+def _joined(names: Iterable[str]) -> str:
+    return " and ".join(map(repr, names))
 
 
 def names_of(arrows: Iterable[Arrow]) -> str:

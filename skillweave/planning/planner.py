@@ -19,7 +19,7 @@ from skillweave.planning.calls import CallLog
 from skillweave.planning.columns import columns_of
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph, planning_states
-from skillweave.planning.lacking import obstacle
+from skillweave.planning.lacking import asks_nothing, obstacle
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission import as_task
 from skillweave.planning.neighbors import check_features
@@ -28,10 +28,15 @@ from skillweave.policies.plan import Near
 from skillweave.policies.planned import Planned
 from skillweave.policies.spaces import space_of
 from skillweave.schema import AtLeastOne, Check, Fraction, fitted
+from skillweave.skills.goal_spaces import MOST_SHOWN, shown_goal
 from skillweave.skills.selector import ReadySelector
 from skillweave.skills.skill_set import SkillSet, skills_below
 from skillweave.types import Array
 
+ALIKE = 0.1
+"""The share of all goals' range below which goals are shown as one."""
+MOST_NAMED = 3
+"""The most goals that are named one by one."""
 MOST_GOALS = 256
 """Goals whose plans are kept."""
 _ToTen = Annotated[float, Check("from 0 to 10", lambda x: 0 <= x <= 10)]
@@ -151,6 +156,8 @@ class Planner(ReadySelector):
         where each observation has a goal of its own."""
         self.obstacle = ""
         """Why no order of logged steps does the task; empty: one does, or it has no end."""
+        self.already = asks_nothing(self.machine, log)
+        """Which words of the task hold before anything is done; empty: it asks for something."""
         if isinstance(self.task, RewardMachine):
             self.plan = self._solve(self.task)
             self.obstacle = obstacle(self.task, log)
@@ -237,6 +244,36 @@ class Planner(ReadySelector):
         near = self.graph.near(obs)
         q = self.in_place.valued(near, obs, self.states.corners(state))
         return self.in_place.choose(q, may, rng), near
+
+    def shown_goals(self, skill: int, calls: Array) -> str:
+        """Return the goals of some calls of a skill in a few words; empty: it has none.
+
+        Goals of numbers are shown by the middle 80 % of each; others are counted.
+
+        Args:
+            skill: its place.
+            calls: (n,) calls of the graph whose goals they are; −1: none.
+        """
+        goals = self.graph.log.goals.get(self.log.skills[skill])
+        if goals is None or (calls < 0).any():
+            return ""
+        mine, space = goals[calls], None
+        if self.graph.skills is not None:
+            space = self.graph.skills.skills[skill].goal_space
+        if goals.shape[1] > MOST_SHOWN:
+            return f"({goals.shape[1]} numbers)"
+        if space is None or (isinstance(space, gym.spaces.Box) and space.dtype.kind == "f"):
+            spread = np.ptp(goals[self.graph.log.skill == skill], 0)
+            low, high = np.quantile(mine, (0.1, 0.9), axis=0)
+            each = [
+                f"{a:.3g} to {b:.3g}" if b - a > ALIKE * whole else f"{m:.3g}"
+                for a, b, m, whole in zip(low, high, np.median(mine, 0), spread, strict=True)
+            ]
+            return f"({', '.join(each)})"
+        unique, counts = np.unique(mine, axis=0, return_counts=True)
+        often = unique[np.argsort(-counts, kind="stable")][:MOST_NAMED]
+        names = [shown_goal(one) for one in space_of(space).of_numbers(often)]
+        return " or ".join([*names, *["others"] * (len(unique) > MOST_NAMED)])
 
     @property
     def compared(self) -> dict[str, list[int] | None]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from .core import LIMIT, Array, LastCall, Memory, Step, Turn, own_step
 from .errors import PolicyError
-from .plan import SOFT, Features, Levels, Machine, Near, Options, check, nearest_corner
+from .plan import SOFT, Features, Levels, Machine, Near, Options, Readings, check, nearest_corner
 from .selectors import Rule
 from .spaces import Space
 
@@ -126,9 +126,24 @@ class Planned(Rule):
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return choices (k,); where it has ``goals``, they have goals."""
+        option, near = self.decide(memory, rows, obs, turn, bool(self.goals))
+        call = near.goal[np.arange(len(rows)), option]
+        return self.record(self.options.choice_of[option], call, obs)
+
+    def decide(
+        self, memory: Memory, rows: Array, obs: Array, turn: Turn, with_goals: bool
+    ) -> tuple[Array, Near]:
+        """Return options (k,), with the nearest calls; remember the calls that begin.
+
+        Args:
+            with_goals: these calls have the goals of their options; a guide does not say which.
+        """
         features, each = [own(obs) for own in self.features], np.arange(len(rows))
         tried = memory["tried"]
-        near, corners = self.options.near(features), self.levels.corners(_state(memory, rows))
+        near, corners = (
+            self.options.near(features),
+            self.levels.corners(self.state_of(memory, rows)),
+        )
         may = turn.mask
         may = np.ones((len(rows), self.count), bool) if may is None else may
         now = {
@@ -143,14 +158,14 @@ class Planned(Rule):
         ended = np.flatnonzero(tried["count"][rows] > 0)
         _put(tried, rows[ended], -1, {name: value[ended] for name, value in now.items()})
         option = self.choose(self._corrected(tried, rows, now), may, turn.world.rng)
-        choice, call = self.options.choice_of[option], near.goal[each, option]
-        # A guide does not say which goal: that of the call is unknown, and it counts for none.
+        # A call whose goal is unknown counts for none.
+        call = near.goal[each, option]
         unknown = np.where(call < 0, np.float32(0.0), np.float32(np.nan))[:, None]
         new = {
-            "choice": choice,
+            "choice": self.options.choice_of[option],
             "steps": 0,
             "start": now["end"],
-            "goal": now["goals"][each, option] if self.goals else unknown,
+            "goal": now["goals"][each, option] if with_goals else unknown,
             "reward": 0.0,
             "discount": 1.0,
             "from": now["to"],
@@ -158,7 +173,7 @@ class Planned(Rule):
         }
         _put(tried, rows, 0, new)
         tried["count"][rows] += 1
-        return self.record(choice, call, obs)
+        return option, near
 
     def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
         """Move the task's state on, and add the step's rewards to the running calls.
@@ -166,7 +181,11 @@ class Planned(Rule):
         A planner that only guides did not make the choices: they are those of the selector beside
         it.
         """
-        after, reward = self.task.advance(_state(memory, rows), self.task.read(own_step(step)))
+        self.follow(memory, rows, self.task.read(own_step(step)), last)
+
+    def follow(self, memory: Memory, rows: Array, read: Readings, last: LastCall) -> None:
+        """Do what ``watch`` does, with what the task has read of the step."""
+        after, reward = self.task.advance(self.state_of(memory, rows), read)
         memory["state"][rows], memory["counters"][rows] = after[:, 0], after[:, 1:]
         tried = memory["tried"]
         latest = rows, (tried["count"][rows] - 1) % LATEST
@@ -190,6 +209,10 @@ class Planned(Rule):
         length = np.where(other | (last.why == LIMIT), at, choice % count)
         called: Array = last.skill * count + np.minimum(length, count - 1)
         return called
+
+    def state_of(self, memory: Memory, rows: Array) -> Array:
+        """Return the task's state in a memory, (k, 1 + H)."""
+        return np.concatenate([memory["state"][rows, None], memory["counters"][rows]], 1)
 
     # Values
 
@@ -249,13 +272,16 @@ class Planned(Rule):
         return whole
 
     def _aims(self, near: Near) -> Array:
-        """Return the standardised goals of options, (n, O, G); 0 where they have none."""
+        """Return the standardised goals of options, (n, O, G).
+
+        They are 0 for skills without goals, and NaN for an option that lacks a call.
+        """
         found = np.zeros((*near.goal.shape, self._aim), np.float32)
         for skill, aims in enumerate(self.options.aims):
             if aims is not None:
                 mine = self.options.skills == skill
                 call = near.goal[:, mine]
-                found[:, mine, : aims.shape[1]] = np.where(call[..., None] >= 0, aims[call], 0.0)
+                found[:, mine, : aims.shape[1]] = np.where(call[..., None] >= 0, aims[call], np.nan)
         return found
 
     # The calls of the episode
@@ -316,11 +342,6 @@ class Planned(Rule):
         same = (ends["to"][:, :, None] == calls["from"][:, None]) & (choice >= 0)[:, None]
         of = choice[:, None, :, None] == self.options.choice_of
         return far, same[..., None] & of & (far <= ends["far"][:, :, None] + SLACK)
-
-
-def _state(memory: Memory, rows: Array) -> Array:
-    """Return the task's state in a memory, (k, 1 + H)."""
-    return np.concatenate([memory["state"][rows, None], memory["counters"][rows]], 1)
 
 
 def _best(q: Array, may: Array) -> Array:

@@ -33,7 +33,6 @@ from skillweave.skills.probing import MOST_BYTES
 from skillweave.skills.rows import largest_difference, other_rows, parts_of, shown
 from skillweave.types import Array, Memoryless
 
-
 ROUNDING = 0.03
 """The largest difference of outputs, relative to their size, that is rounding: that of 8 bits."""
 

@@ -81,8 +81,8 @@ def test_calls_count_for_one_another_by_start_and_goal():
     option = planner.graph.near(np.zeros((1, 1), np.float32))
     aims = goals[option.goal[0]]
     worth = (planner.plan[option.pieces[0], 0] * option.weights[0]).sum(1)
-    assert (worth[aims > 0.6] > 0.99).all()
-    assert (worth[aims < 0.4] < 0.01).all()
+    assert (worth[aims > 0.7] > 0.99).all()
+    assert (worth[aims < 0.3] < 0.01).all()
     assert ((worth > 0.01) & (worth < 0.99)).any()  # beside the edge, where a neighbor differs
 
 
@@ -117,7 +117,8 @@ def test_a_logged_goal_has_no_distance_to_itself():
     """Not even by rounding, where its numbers are large beside their differences."""
     log = log_of(["go"], [(0, [(0, [i], True, "end")]) for i in range(40)])
     log.goals["go"] = np.random.default_rng(0).normal(size=(40, 2))
-    near = CallGraph(log, neighbors=1).near(np.zeros((1, 1), np.float32))
+    # So few calls cannot do without a goal's own one.
+    near = CallGraph(log, neighbors=5).near(np.zeros((1, 1), np.float32))
     assert (near.distance == 0).all()
 
 
@@ -219,7 +220,8 @@ def test_a_skill_with_goals_that_was_never_called_is_not_chosen():
     run = ready()
     log = run.log_calls(300, num_envs=4)
     rests = log.take(np.flatnonzero(log.skill == 1))
-    with pytest.warns(UserWarning, match="no call of 'go_to'"):
+    nothing = pytest.warns(UserWarning, match="asks for nothing")
+    with pytest.warns(UserWarning, match="no call of 'go_to'"), nothing:
         planned = run.plan(lambda obs: obs[:, 0] > -5, rests)
     assert planned.evaluate(3, quiet=True).mean == 1.0
 

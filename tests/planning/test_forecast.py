@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from goals.test_plans_of_goals import jumps
 from planning.logs import log_of
 from planning.steps import at
 
-from skillweave.planning import CallLog, GoalTask, Mission, Planner, RewardMachine, held
+from skillweave.planning import (
+    CallLog,
+    GoalTask,
+    Mission,
+    Planner,
+    RewardMachine,
+    either,
+    held,
+)
 from skillweave.planning.forecast import forecast
+from skillweave.planning.lacking import asks_nothing
 
 A, B = 0, 1
+NINE, NOT_NINE = at(9), ~at(9)
 
 
 def goes_right(share: float, episodes: int = 100) -> CallLog:
@@ -111,3 +124,74 @@ def test_what_is_avoided_and_holds_at_the_start_is_named():
     assert expected.chance < 0.2
     assert "'at 0.5'" in expected.reason
     assert "first steps" in expected.reason
+
+
+def lucky(share: float, seed: int, calls: int = 400) -> CallLog:
+    """Calls of a skill with goals from about 0, of which a share ends at 5, whatever the goal."""
+    rng = np.random.default_rng(seed)
+    starts, ends = rng.normal(0, 0.1, calls), np.where(rng.random(calls) < share, 5, -5)
+    log = log_of(["go"], [(x, [(A, [y], True, "end")]) for x, y in zip(starts, ends, strict=True)])
+    log.goals["go"] = rng.uniform(-1, 1, (calls, 2))
+    return log
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_luckiest_of_many_goals_promises_no_more_than_others(share, seed):
+    expected = forecast(Planner(lucky(share, seed), Mission(at(5))))
+    assert share - 0.15 < expected.chance < share + 0.25
+    assert expected.interval[0] <= share <= expected.interval[1]
+
+
+def test_goals_that_matter_are_promised():
+    """From 0 to 10, three steps at a time: the goal says which way."""
+    rng = np.random.default_rng(0)
+    log = jumps(np.sort(rng.uniform(0, 10, 80)).tolist())
+    expected = forecast(Planner(log, Mission(lambda obs: obs[:, 0] > 8)))
+    assert expected.chance > 0.8
+    assert expected.interval[1] >= expected.chance
+    # The last call goes right, and its goal is shown: a number, or a range of them.
+    assert expected.goals[-1].startswith("(")
+    assert f"go {expected.goals[0]} (" in str(expected)
+
+
+@pytest.mark.parametrize("episodes", [1, 3])
+def test_a_log_of_few_episodes_gives_no_chance_of_goals(episodes):
+    log = lucky(0.6, 0)
+    calls = np.arange(len(log))
+    few = replace(log, episode=calls % episodes, order=calls // episodes)
+    expected = forecast(Planner(few, Mission(at(5))))
+    assert expected.chance is None
+    assert expected.interval == (0.0, 1.0)
+    assert f"{episodes} episode" in expected.reason
+
+
+def test_calls_that_began_too_late_are_no_evidence():
+    """A call takes up to four steps; those that succeed at once began in the last step."""
+    late = [(A, [0, 0, 0, 0], False, "limit")] * 3 + [(A, [1], True, "own")]
+    log = log_of(["a"], [(0, [*late, (A, [1], False, "cut")])] * 30, limits=[4])
+    assert log.began_late.sum() == 60
+    assert forecast(Planner(log, Mission(at(1)))).chance == 0.0
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        (Mission(at(0)), ["'at 0'", "100%"]),
+        (Mission(at(0), either(at(0) & at(0), at(7))), ["'at 0'"]),
+        (Mission(NOT_NINE, at(2)), ["'not at 9'", "nearly all logged steps"]),
+        (Mission(either(at(0), at(2))), ["'at 0'"]),
+        (Mission(at(1)), []),
+        (Mission(at(0), at(2)), []),  # "home, then key" asks for the key
+        (Mission(at(2), avoid=NINE), []),
+        (Mission(held(NOT_NINE, 3), at(2)), []),
+        (Mission(at(0) & at(1), at(2)), []),
+        (Mission(at(1), at(2), repeat=None), []),
+    ],
+)
+def test_words_that_hold_before_anything_is_done_are_said(task, words):
+    way = [(A, [0, 0, 0, 1], True, "own"), (B, [2], True, "own")]
+    log = log_of(["a", "b"], [(0, way)] * 20)
+    said = asks_nothing(task, log)
+    assert bool(said) == bool(words)
+    assert all(word in said for word in words)
