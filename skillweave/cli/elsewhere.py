@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 
 from skillweave._internal.messages import ELSEWHERE, suggest
+from skillweave.training.options import Reports
 
 COMMANDS = {
     "enjoy": "evaluate, or render for a film",
@@ -51,6 +52,21 @@ SAME = {
     "workers": "num-workers",
 }
 """Other names of these options."""
+SETTINGS = (
+    "batch_size",
+    "buffer_size",
+    "clip_coef",
+    "device",
+    "ent_coef",
+    "gae_lambda",
+    "gamma",
+    "learning_rate",
+    "n_steps",
+    "num_envs",
+    "tau",
+    "update_epochs",
+)
+"""Settings of algorithms that are options elsewhere; here is no list of all, to start quickly."""
 
 
 def foreign_words(words: Sequence[str], commands: Mapping[str, type]) -> str:
@@ -88,13 +104,10 @@ def _way(option: str, trains: bool) -> str | None:
         return None
     if way := OPTIONS.get(SAME.get(option, option)):
         return way
-    from skillweave.algorithms.config import DQN, PPO, SAC, TD3
-    from skillweave.training.options import Reports
-
     setting = option.replace("-", "_")
     setting = ELSEWHERE.get(setting, setting)
     if any(setting == field.name for field in fields(Reports)):
         return f"--set train.{setting}=VALUE"
-    if any(setting == field.name for kind in (PPO, DQN, TD3, SAC) for field in fields(kind)):
+    if setting in SETTINGS:
         return f"--set selector.{setting}=VALUE, and --set skills.NAME.{setting}=VALUE for a skill"
     return None

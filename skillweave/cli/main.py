@@ -84,7 +84,6 @@ def _main(words: Sequence[str], put: Put, alone: bool) -> int:
             from skillweave.cli import commands
             from skillweave.cli.elsewhere import foreign_words
             from skillweave.errors import SkillweaveError
-            from skillweave.runs.command_words import called_by
 
             parser: dict[str, Any] = {commands.name_of(c): c for c in commands.COMMANDS}
             if wrong := foreign_words(words, parser):
@@ -97,6 +96,7 @@ def _main(words: Sequence[str], put: Put, alone: bool) -> int:
                 args=_for_tyro(words),
             )
             from skillweave.cli import execute
+            from skillweave.runs.command_words import called_by
     except KeyboardInterrupt:
         return _fail(words, put, "interrupted", 130)
     try:

@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from skillweave._internal.messages import error_text, suggest
+from skillweave._internal.messages import error_text, short, suggest
 from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.policies.core import flat
@@ -41,7 +41,7 @@ MLFLOW_LONGEST_SETTING = 500
 """The most characters of a setting's value in MLflow."""
 MLFLOW_LONGEST_NAME = 250
 """The most characters of the name of a metric or a setting in MLflow."""
-MLFLOW_LONGEST_KEY = 100
+MLFLOW_LONGEST_KEY = 180
 """The most characters of a key of ``info`` in such a name."""
 MLFLOW_REFUSED = re.compile(r"[^\w.\- /]" if os.name == "nt" else r"[^\w.\- /:]")
 """A character that MLflow refuses in names."""
@@ -214,7 +214,7 @@ class MLflow(Tracker):
         self._metric = importlib.import_module("mlflow.entities").Metric
         self._run = run
         self._keys = mlflow_keys(run.manifest.log_info)
-        changed = [f"{k!r} is {name!r}" for k, name in self._keys.items() if k != name]
+        changed = [f"{short(k)} is {short(v)}" for k, v in self._keys.items() if k != v]
         if changed and not run.finished:
             notice(
                 "MLflow refuses some letters and lengths in names, so of log_info there "

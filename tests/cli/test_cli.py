@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -655,6 +655,15 @@ MISTAKES: dict[str, tuple[list[str], int, list[str]]] = {
     "long recipe": (["info", "a" * 300], 1, ["target is", "too long"]),
     "nothing to train": (["train"], 2, ["Missing", "A shipped recipe"]),
 }
+
+
+def test_settings_that_are_options_elsewhere_exist_here() -> None:
+    from skillweave import DQN, PPO, SAC, TD3
+    from skillweave.cli.elsewhere import OPTIONS, SAME, SETTINGS
+
+    known = {field.name for kind in (PPO, DQN, SAC, TD3) for field in fields(kind)}
+    assert set(SETTINGS) <= known
+    assert set(SAME.values()) <= set(OPTIONS)
 
 
 def test_what_a_message_says_to_write_instead_works(
