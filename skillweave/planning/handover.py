@@ -647,11 +647,11 @@ class Blame:
             )
         if self.after == START:
             return f"{text}. So it has to learn to start here, too"
-        ends = "" if self.differs is None else f"{self.after!r} has to end there, "
-        return (
-            f"{text}. So {ends}another skill has to come in between, or {self.skill!r} has to "
-            f"learn to start where {self.after!r} ends"
-        )
+        between = "another skill has to come in between"
+        text = f"{text}. So {self.skill!r} itself has to work from there"
+        if self.differs is None:
+            return f"{text}, or {between}"
+        return f"{text}, {between}, or {self.after!r} has to end where {self.skill!r} works"
 
     def _difference(self) -> str:
         if self.place is None:
