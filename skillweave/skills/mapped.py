@@ -261,9 +261,11 @@ def look_at_outputs(policy: MappedPolicy) -> None:
         sizes = {len(obs), *(n for x in (obs, *first.values()) for n in x.shape[1:])}
         rows = other_rows(first, len(obs), sizes, len(obs), 0)
         other = twin.outputs(obs[rows])
-        differs = largest_difference(first, other, rows, ROUNDING)
+        differs = largest_difference(first, other, rows, ROUNDING, ROUNDING)
         if written:
-            fresh = largest_difference(first, policy.twin().outputs(obs[rows]), rows, ROUNDING)
+            fresh = largest_difference(
+                first, policy.twin().outputs(obs[rows]), rows, ROUNDING, ROUNDING
+            )
             if (fresh is None) != (differs is None):
                 raise PolicyError(hidden)
         if differs:
@@ -279,8 +281,8 @@ def look_at_outputs(policy: MappedPolicy) -> None:
 def hidden_state(written: Sequence[str]) -> str:
     """Return a clause about the tensors that a module writes, and by which it answers."""
     return (
-        f"keeps a hidden state, {', '.join(map(repr, written[:3])) or 'an attribute'}, which would run "
-        "on from one episode into the next, and which all environments would share: let "
+        f"keeps a hidden state, {', '.join(map(repr, written[:3])) or 'an attribute'}, which would "
+        "run on from one episode into the next, and which all environments would share: let "
         "forward(obs, state) return the output and the next state, and give the shape of the "
         "state, from_torch(module, state=(None, 64))"
     )

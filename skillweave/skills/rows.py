@@ -175,13 +175,18 @@ def parts_of(answer: Any) -> dict[str, Array]:
 
 
 def largest_difference(
-    answer: Mapping[str, Array], other: Mapping[str, Array], rows: Array, close: float = 1e-3
+    answer: Mapping[str, Array],
+    other: Mapping[str, Array],
+    rows: Array,
+    close: float = 1e-3,
+    of_largest: float = 1e-5,
 ) -> tuple[Any, Any, int] | None:
     """Return the answers that differ most, and their row; None: all are equal but for rounding.
 
     Args:
         rows: of the ``answer``, those of which ``other`` is.
-        close: the largest difference that is rounding, for a number of size 1.
+        close: the part of a number up to which a difference is rounding.
+        of_largest: and of the largest number.
     """
     for name, x in answer.items():
         one, two = x[rows].reshape(len(rows), -1), other[name].reshape(len(rows), -1)
@@ -191,7 +196,7 @@ def largest_difference(
         }:
             one, two = one.astype(np.float64), two.astype(np.float64)
             size = np.abs(one, where=np.isfinite(one), out=np.zeros(one.shape))
-            least = 1e-6 + close * (size + 0.1 * size.max(initial=0.0))
+            least = 1e-6 + close * size + of_largest * size.max(initial=0.0)
             differs = ~(
                 (np.abs(one - two) <= least) | (one == two) | (np.isnan(one) & np.isnan(two))
             )
