@@ -66,6 +66,24 @@ def test_a_new_task_is_planned_and_scored_by_itself(run, log):
     assert (round(paid, 6), info["success"], info["env_reward"]) == (1.0, True, 0.0)
 
 
+def test_explain_may_play_the_plan(run, log):
+    planned = run.plan(Mission(at_four, door_open), log)
+    expected, found = planned.explain(), planned.explain(episodes=8)
+    assert (expected.episodes, found.episodes) == (0, 8)
+    assert found.chance == planned.evaluate(8, quiet=True).success_rate
+    assert found.interval[0] < found.chance <= found.interval[1] + 1e-9
+    assert "of 8 played episodes" in str(found)
+    assert planned.explain() == expected
+    with pytest.raises(DeclarationError, match="episodes"):
+        planned.explain(episodes=-1)
+
+
+def test_a_mission_that_is_done_already_is_said_before_it_is_played(run, log):
+    with pytest.warns(UserWarning, match="'somewhere' holds already in 100% of the logged starts"):
+        planned = run.plan("somewhere", log, predicates={"somewhere": lambda obs: obs[:, 0] > -9})
+    assert planned.explain().already in str(planned.explain())
+
+
 def test_a_reward_alone_has_no_success(run, log):
     def far(step):
         return step.next_obs[:, PLACE] / 100
