@@ -105,6 +105,8 @@ class Forecast:
             text += f" ({low:.0%} to {high:.0%})"
         elif self.chance is not None:
             text += f": a chance of {self.chance:.0%} ({low:.0%} to {high:.0%})"
+        elif self.reason:
+            text += ": no known chance"
         text += f", about {self.steps:.0f} steps"
         if self.unsure:
             text += f"; unsure, as the log has few calls near there: {', '.join(self.unsure)}"
