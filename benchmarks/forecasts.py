@@ -250,7 +250,7 @@ class Mover(sw.Skill):
 def with_goals(world: World) -> list[sw.Skill]:
     """Return one mover, to any place."""
     if world.discrete is None:
-        low, high = np.float32([0.2, 0.2]), np.float32(world.size) - np.float32(0.2)
+        low, high = np.full(2, 0.2, np.float32), np.array(world.size, np.float32) - np.float32(0.2)
         space: gym.Space[Any] = gym.spaces.Box(low, high)
         grid = None
     else:
@@ -266,7 +266,7 @@ def with_goals(world: World) -> list[sw.Skill]:
         def to(self, obs: Array, goal: Any = None) -> Any:
             return goal if grid is None else grid[np.asarray(goal).astype(int)]
 
-        def policy(self, obs: Array, goal: Any) -> Array:  # type: ignore[override]
+        def policy(self, obs: Array, goal: Any) -> Array:
             return straight(obs, self.to(obs, goal))
 
     return [GoTo()]
@@ -282,7 +282,7 @@ def to_places(world: World) -> list[sw.Skill]:
             def to(self, obs: Array, goal: Any = None) -> Any:
                 return np.array(place)
 
-            def policy(self, obs: Array) -> Array:  # type: ignore[override]
+            def policy(self, obs: Array) -> Array:
                 return straight(obs, np.array(place))
 
         return To()
@@ -298,7 +298,7 @@ class Pick(Mover):
         free: Array = obs[:, HAS] == 0
         return free
 
-    def policy(self, obs: Array) -> Array:  # type: ignore[override]
+    def policy(self, obs: Array) -> Array:
         """Go there."""
         return straight(obs, obs[:, [IX, IY]])
 
@@ -336,13 +336,15 @@ def run_of(world: World, goals: bool) -> sw.Run:
 
         class Bring(Mover):
             def initiation(self, obs: Array) -> Array:
-                return obs[:, HAS] == 1
+                carries: Array = obs[:, HAS] == 1
+                return carries
 
-            def policy(self, obs: Array) -> Array:  # type: ignore[override]
+            def policy(self, obs: Array) -> Array:
                 return straight(obs, depot)
 
             def termination(self, step: Step) -> Array:
-                return step.next_obs[:, HAS] == 0
+                free: Array = step.next_obs[:, HAS] == 0
+                return free
 
         skills.append(Bring())
     env = type("Plane", (Plane,), {"world": world})

@@ -157,9 +157,7 @@ def judged(run: sw.Run, mission: str, words: Words, episodes: int) -> Row | None
         return None
     except RunError:
         return Row(mission, 0.0, 0.0, True)
-    chance, planner = planned.explain().chance, planned.hierarchy.selector
-    assert isinstance(planner, Planner)
-    assert chance is not None
+    chance, planner = planned.explain().chance or 0.0, planned.hierarchy.selector
     assert isinstance(planner, Planner)
     succeeded = planned.evaluate(episodes, quiet=True).succeeded or 0
     return Row(mission, chance, succeeded / episodes, bool(planner.obstacle))

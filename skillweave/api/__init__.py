@@ -623,8 +623,9 @@ class TrainedPolicy:
         if planner.already:
             notice(planner.already)
         if planner.plan.size and (expected := run.explain()).reason:
-            share = "unknown" if expected.chance is None else f"{expected.chance:.0%}"
-            notice(f"this plan has a chance of {share}: {expected.reason}")
+            share = expected.chance
+            chance = "no known chance" if share is None else f"a chance of {share:.0%}"
+            notice(f"this plan has {chance}: {expected.reason}")
         return run
 
     def _own_spec(self) -> EnvSpec:

@@ -105,6 +105,8 @@ class Forecast:
             text += f" ({low:.0%} to {high:.0%})"
         elif self.chance is not None:
             text += f": a chance of {self.chance:.0%} ({low:.0%} to {high:.0%})"
+        elif self.reason:
+            text += ": no known chance"
         text += f", about {self.steps:.0f} steps"
         if self.unsure:
             text += f"; unsure, as the log has few calls near there: {', '.join(self.unsure)}"
@@ -205,7 +207,8 @@ class _Calls:
         mine = log.goals[name][log.choice == choice]
         apart = are_apart(len(np.unique(mine, axis=0)), len(mine))
         goals = standard(log.goals[name][aim]) * (OTHER_GOAL if apart else 1.0)
-        return np.concatenate([features, goals], 1, dtype=np.float32)
+        points: Array = np.concatenate([features, goals], 1, dtype=np.float32)
+        return points
 
     def like(self, choice: int, obs: Array, aim: Array, rng: np.random.Generator) -> Array:
         """Return a piece of a call near by start and goal, (n,) int64; −1: none is near.
@@ -358,10 +361,17 @@ def _follow(
     may, running = np.ones((n, log.choices), bool), np.ones(n, bool)
     if graph.skills is not None:
         may = graph.skills.hierarchy.may_start(first)
+    shape = (MOST_CALLS, n)
     history = _Followed(
-        *(np.full((MOST_CALLS, n), empty) for empty in (-1, 0, -1, -1, -1)),
-        last=np.zeros(n, np.int64), done=np.zeros(n, bool), known=np.ones(n, bool),
-    )  # fmt: skip
+        skill=np.full(shape, -1),
+        steps=np.zeros(shape, np.int64),
+        call=np.full(shape, -1),
+        aim=np.full(shape, -1),
+        state=np.full(shape, -1),
+        last=np.zeros(n, np.int64),
+        done=np.zeros(n, bool),
+        known=np.ones(n, bool),
+    )
     for number in range(MOST_CALLS):
         here = np.flatnonzero(running)
         may_here = may[here] | ~may[here].any(1, keepdims=True)
