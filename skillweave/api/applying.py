@@ -213,11 +213,14 @@ def _check_place(spec: EnvSpec, what: str, run: RunDirectory) -> None:
     mine, my_kwargs = spec.name, spec.json_kwargs
     if (theirs, their_kwargs) == (mine, my_kwargs):
         return
+    renamed = ""
     if theirs == mine:
         theirs, mine = f"{theirs} made with {their_kwargs}", f"one made with {my_kwargs}"
+    elif not isinstance(spec.env, str):
+        renamed = f". If its function was only renamed, set {mine}.__name__ = {theirs!r}"
     raise RunError(
         f"{run.path} was trained on {theirs}, but this {what} is on {mine}. Load it where it was "
-        "trained; to try its policy elsewhere then: evaluate(run.policy, env)"
+        f"trained; to try its policy elsewhere then: evaluate(run.policy, env){renamed}"
     )
 
 

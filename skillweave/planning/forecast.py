@@ -200,7 +200,8 @@ class _Calls:
         """
         log = self._graph.log
         skill = log.skill_of(choice)
-        features, name = self._graph.maps[skill](obs), log.skills[skill]
+        name = log.skills[skill]
+        features: Array = self._graph.maps[skill](obs)
         standard = goal_standard(log, name)
         if standard is None:
             return features

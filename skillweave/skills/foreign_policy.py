@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -120,6 +120,15 @@ def fitted(
     return policy
 
 
+def _other_parts(mine: Space[Any], theirs: Space[Any]) -> str:
+    """Return a clause that names parts which only one of two spaces has; nothing if none."""
+    ours, others = (getattr(space, "spaces", None) for space in (mine, theirs))
+    if not isinstance(ours, Mapping) or not isinstance(others, Mapping):
+        return ""
+    names = ", ".join(map(repr, sorted(map(str, ours.keys() ^ others.keys()))))
+    return f" (only one of them has {names})" if names else ""
+
+
 def check_spaces(
     policy: Policy, observation_space: Space[Any], action_space: Space[Any], whose: str, env: str
 ) -> None:
@@ -137,6 +146,7 @@ def check_spaces(
         if not same_space(mine, theirs):
             raise PolicyError(
                 f"{whose} has {kind} {mine}, but the environment {env} has {theirs}"
+                + _other_parts(mine, theirs)
                 + f": {advice}" * hasattr(policy, "mapping")
             )
     if other_bounds(policy.action_space, action_space):

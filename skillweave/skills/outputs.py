@@ -249,7 +249,9 @@ def _advice(error: BaseException, function: Any, argument: Any, ids: Array | Non
     ):
         kind = "Tuple" if keys[0] == "0" else "Dict"
         names = ", ".join(map(repr, keys))
-        return f"; the observation is a {kind} with the keys {names}: write {example}"
+        wrong = text.partition("no field of name ")[2].strip("'\"")
+        meant = suggest(wrong, keys, listed=False) if wrong else ""
+        return f"; the observation is a {kind} with the keys {names}{meant or f': write {example}'}"
     if isinstance(error, IndexError) and step:
         return f"; step.next_obs has the shape {argument.next_obs.shape}"
     return ""
