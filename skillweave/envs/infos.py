@@ -253,7 +253,8 @@ def _column(
             numbers[row] = number
         elif odd is None:
             shape = np.shape(value) if isinstance(value, np.ndarray) else ()
-            odd = f"an array of shape {shape}" if shape else f"of type {type(value).__name__}"
+            name = "dict" if isinstance(value, dict) else type(value).__name__
+            odd = f"an array of shape {shape}" if shape else f"of type {name}"
     return numbers, present, odd
 
 

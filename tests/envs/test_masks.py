@@ -296,10 +296,14 @@ def test_a_hierarchy_learns_to_drive_gymnasiums_taxi_by_its_masks(tmp_path):
 def test_what_a_policy_made_elsewhere_takes_is_for_the_environment_to_judge():
     # Taxi stands still, and the others may raise: both are the environment's own rule.
     stubborn = ScriptedPolicy(lambda obs: np.full(len(obs), 5), *_spaces("Taxi-v4"))
-    found = evaluate(stubborn, EnvSpec("Taxi-v4"), episodes=2)
+    with pytest.warns(UserWarning, match=r"chose the action 5, which .* mask forbids"):
+        found = evaluate(stubborn, EnvSpec("Taxi-v4"), episodes=2)
     assert found.lengths == (200, 200)
     stubborn = ScriptedPolicy(lambda obs: np.full(len(obs), 3), *_spaces(Gate))
-    with pytest.raises(EnvError, match=r"step 1 of its episode.*3 is forbidden"):
+    with (
+        pytest.warns(UserWarning, match="chose the action 3, which .* mask forbids"),
+        pytest.raises(EnvError, match=r"step 1 of its episode.*3 is forbidden"),
+    ):
         evaluate(stubborn, EnvSpec(Gate), episodes=1)
 
 

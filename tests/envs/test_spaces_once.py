@@ -36,8 +36,8 @@ def test_a_hierarchy_reads_the_spaces_of_its_environment_once(tmp_path: Any, lea
         while frame is not None:
             names.add(frame.f_code.co_name)
             frame = frame.f_back
-        # Engines and evaluations make the environments that they step.
-        reads += not names & {"make_engine", "evaluate", "workers_for"}
+        # Engines, their checks and evaluations make the environments that they step.
+        reads += not names & {"make_engine", "check_used", "evaluate", "workers_for"}
         return gym.make("CartPole-v1")
 
     guide = sw.Guide(lambda obs: np.zeros(len(obs), int), restrict=False, target_kl=1.0)
