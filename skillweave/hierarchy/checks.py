@@ -12,7 +12,7 @@ from skillweave.algorithms.config import PPO, AlgorithmSettings
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.roles import Level, Nestable, Roles
-from skillweave.hierarchy.settings import Guide
+from skillweave.hierarchy.settings import Guide, Settings
 from skillweave.runs.manifest import Target
 from skillweave.schema import fitted
 from skillweave.skills import Automaton, Skill, ready_policy
@@ -159,11 +159,11 @@ def _check_guide(level: Level, guide: Guide) -> None:
 def _check_calls(level: Level) -> None:
     """Raise a DeclarationError where calls of skills would never end.
 
-    Give a notice where a skill seems to have no limit of its calls, and has the hierarchy's.
+    Give a notice where a skill that ends itself seems to have no limit, and has the usual one.
     """
     if level.call_steps is not None:
         for skill in level.skills.values():
-            if _undoes_call_steps(skill):
+            if level.call_steps == Settings.call_steps and _undoes_call_steps(skill):
                 notice(
                     f"skill {skill.name!r}: call_steps = None lifts no limit of its calls: "
                     f"it means the hierarchy's call_steps, {level.call_steps}. For calls that last "
@@ -180,10 +180,14 @@ def _check_calls(level: Level) -> None:
 
 
 def _undoes_call_steps(skill: Skill) -> bool:
-    """Return whether a skill sets call_steps to None where no class above it gives a number."""
-    places = [vars(skill), *map(vars, type(skill).__mro__)]
-    set_to = [place["call_steps"] for place in places if "call_steps" in place]
-    return len(set_to) > 1 and all(value is None for value in set_to)
+    """Return whether a skill that ends itself says call_steps = None in its class.
+
+    A None that takes back the number of a class above is meant so.
+    """
+    kinds = type(skill).__mro__
+    said = [vars(kind)["call_steps"] for kind in kinds if "call_steps" in vars(kind)]
+    only_none = len(said) > 1 and not any(said) and skill.call_steps is None
+    return only_none and skill.defines("termination")
 
 
 def _check_rest(level: Level) -> None:

@@ -132,23 +132,53 @@ def test_changed_limits_of_calls_are_said_by_load(tmp_path, recwarn):
             sw.load(tmp_path / "run", changed)
 
 
-def test_call_steps_of_none_in_a_skill_is_said_to_be_the_hierarchys(tmp_path, recwarn):
-    class Again(Up):
-        call_steps = 3
+class Ends(Up):
+    call_steps = None
 
-    class Undone(Again):
-        call_steps = None
+    def termination(self, step):
+        return step.elapsed >= 7
 
-    sw.Hierarchy(Timed, [Undone()], selector=lambda obs: [0] * len(obs)).train(
-        tmp_path / "a", quiet=True
-    )
-    assert not [w for w in recwarn if "call_steps" in str(w.message)]
-    skill = Up()
+
+class Again(Ends):
+    call_steps = 3
+
+
+class Undone(Again):
+    call_steps = None
+
+
+class Endless(Up):
+    call_steps = None
+
+
+class Plain(Up):
+    termination = Ends.termination
+
+
+def set_by_a_program():
+    skill = Plain()
     skill.call_steps = None
-    with pytest.warns(match="it means the hierarchy's call_steps, 5"):
-        sw.Hierarchy(Timed, [skill], call_steps=5, selector=lambda obs: [0] * len(obs)).train(
-            tmp_path / "b", quiet=True
-        )
+    return skill
+
+
+@pytest.mark.parametrize(
+    ("make", "how", "told"),
+    [
+        (Ends, {}, True),
+        (type("Below", (Ends,), {}), {}, True),
+        (Ends, {"call_steps": 5}, False),
+        (Ends, {"call_steps": None}, False),
+        (Again, {}, False),
+        (Undone, {}, False),
+        (Endless, {}, False),
+        (Plain, {}, False),
+        (set_by_a_program, {}, False),
+    ],
+)
+def test_call_steps_of_none_in_a_skill_is_said_to_be_the_hierarchys(make, how, told, recwarn):
+    sw.Hierarchy(Timed, [make()], selector=lambda obs: [0] * len(obs), **how)
+    texts = [str(w.message) for w in recwarn]
+    assert ["it means the hierarchy's call_steps, 40" in text for text in texts] == [True] * told
 
 
 def test_the_options_env_names_what_is_to_be_called_first():
