@@ -27,8 +27,8 @@ from skillweave.spaces import obs_codec
 
 NAN = float("nan")
 TOGETHER = [
-    *((kind, "buffer_size", 15, r"at least 16 \(num_envs·\(n_step\+1\)\)") for kind in (DQN,)),
-    (TD3, "buffer_size", 31, r"at least 32 \(num_envs·\(n_step\+1\)\)"),
+    *((kind, "buffer_size", 15, r"at least 16 \(num_envs \* \(n_step \+ 1\)\)") for kind in (DQN,)),
+    (TD3, "buffer_size", 31, r"at least 32 \(num_envs \* \(n_step \+ 1\)\)"),
     *((kind, "network", Network(rnn=RNN()), "without rnn: only PPO supports recurrent networks")
       for kind in (DQN, SAC)),
     *((kind, "critic", Network(rnn=RNN()), "without rnn") for kind in (TD3, PPO)),
