@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from skillweave.buffers import ram
 from skillweave.envs import engine as engines
 
 
@@ -18,3 +19,9 @@ def made(monkeypatch) -> list[int]:
 
     monkeypatch.setattr(engines.GymnasiumEngine, "step", step)
     return count
+
+
+@pytest.fixture
+def little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The machine has one GiB left."""
+    monkeypatch.setattr(ram, "free_memory", lambda: 2**30)

@@ -288,10 +288,11 @@ def test_members_have_scales_of_their_own_by_their_own_discounts():
 # What cannot be
 
 
+@pytest.mark.usefixtures("little_memory")
 def test_a_store_that_does_not_fit_into_memory_is_refused_before_training():
-    config = replace(CONFIG, buffer_size=10**12)
+    config = replace(CONFIG, buffer_size=10**9)
     algorithm = make_algorithm(config, Identity.observation_space, Identity.action_space)
-    with pytest.raises(SkillweaveError, match="lower buffer_size"):
+    with pytest.raises(SkillweaveError, match=r"but 1\.0 GiB are free: lower buffer_size"):
         store_of(algorithm, 4)
 
 
