@@ -41,7 +41,8 @@ GOOD = 0.95
 DOUBTFUL = 0.1
 """A pair with few calls may be weak where it is done so much less often than elsewhere."""
 ALIKE = 0.02
-"""Ends are alike where no number has a larger deviation, relative to its range over the log."""
+"""Ends are alike where no number is on average farther from its mean, relative to its range over
+the log."""
 DIVIDES = 0.7
 """A number divides calls where this share of those that fail starts outside of the others."""
 SELDOM = 0.25
@@ -944,7 +945,8 @@ class LinkedCalls(CallColumns):
         first = good >= as_elsewhere - LIKE_ELSEWHERE and good - bad >= WORSE and low > high
         place, means = _largest_difference(starts[rows], best, changes)
         low, high = np.quantile(starts[:, changes], (0.05, 0.95), axis=0)
-        alike = starts[rows][:, changes].std(0) <= ALIKE * (high - low)
+        ends = starts[rows][:, changes]
+        alike = np.abs(ends - ends.mean(0)).mean(0) <= ALIKE * (high - low)
         return replace(
             unknown,
             best=good,

@@ -204,7 +204,7 @@ class Asked(Rule):
         """Return the function's choices, (k,)."""
         last = {name: read_only(values) for name, values in take(memory, rows).items()}
         more = [LastCall(**last)] if self.takes_last_call else []
-        skill, goals = self.parted(self.function(read_only(obs), *more), len(obs))
+        skill, found = self.parted(self.function(read_only(obs), *more), len(obs))
         if turn.mask is not None:
             wrong = ~turn.mask[np.arange(len(obs)), skill]
             if wrong.any():
@@ -215,17 +215,15 @@ class Asked(Rule):
                     f"{observed(obs[row])}, but its initiation() is False there; choose a skill "
                     f"that may start there: {may}"
                 )
-        found = []
-        for name, values in (goals or {}).items():
-            mine = np.flatnonzero(skill == self.number(name))
-            found.append((name, mine, self._given(name, values, len(obs), mine)))
         return self._with_goals(skill, found, obs)
 
-    def parted(self, value: Any, n: int) -> tuple[Array, dict[str, Any] | None]:
-        """Return the numbers of skills (n,) and the goals by skill in a value of the function.
+    def parted(self, value: Any, n: int) -> tuple[Array, list[tuple[str, Array, Array]]]:
+        """Return the numbers of skills (n,) in a value of the function, and its goals.
+
+        Each entry of the goals is a skill, the rows (m,) in which it is chosen, and their goals.
 
         Raises:
-            SkillError: it has another form, or names unknown skills.
+            SkillError: it has another form, names unknown skills, or its goals do not fit.
         """
         chosen, goals, wrong = value, None, _is_other_form(value)
         if not wrong and isinstance(value, tuple) and len(value) == 2:
@@ -251,7 +249,11 @@ class Asked(Rule):
         if skill.dtype.kind in "UO" and skill.shape == (n,):
             skill = np.array([self.number(name) for name in skill.tolist()], int)
         skill = self._numbers.actions(skill, n, self.who, SkillError)
-        return skill, None if goals is None else self._by_skill(goals)
+        found = []
+        for name, values in ({} if goals is None else self._by_skill(goals)).items():
+            mine = np.flatnonzero(skill == self.number(name))
+            found.append((name, mine, self._given(name, values, n, mine)))
+        return skill, found
 
     def _by_skill(self, goals: Any) -> dict[str, Any]:
         """Return the goals of several skills by their names."""

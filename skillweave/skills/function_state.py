@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-import pickle
 import random
 import sys
 import types
@@ -67,8 +66,8 @@ class State:
 
     def random(self) -> bool:
         """Return whether a generator was used."""
-        now = [*map(_random_state, self._generators)]
-        return pickle.dumps(now) != pickle.dumps(self._random_before)
+        now = map(_random_state, self._generators)
+        return not all(map(_same, now, self._random_before))
 
     @contextmanager
     def restored_afterwards(self) -> Iterator[None]:
@@ -212,6 +211,15 @@ def _reachable(thing: Any, known: dict[int, Any], depth: int = DEPTH) -> Iterato
         return
     for value in list(space.values()) if depth else ():
         yield from _reachable(value, known, depth - 1)
+
+
+def _same(state: Any, other: Any) -> bool:
+    """Return whether two states of a random generator are the same."""
+    if isinstance(state, dict):
+        return all(map(_same, state.values(), other.values()))
+    if isinstance(state, tuple):
+        return all(map(_same, state, other))
+    return bool(np.array_equal(state, other))
 
 
 def _copied(value: Any) -> Any:
