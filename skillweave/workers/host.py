@@ -302,8 +302,11 @@ class WorkerCollectors(Workers, Collectors):
         return self._columns(self.stand(split_states(state, len(self._workers))))
 
     def finish(self) -> None:
-        """Check at the end of training what it has left in the environments."""
-        self.ask("finish", [None] * len(self._workers), kept=False)
+        """Check at the end of training what it has left in the environments.
+
+        A worker that is lost in it is not made again: the training result is there.
+        """
+        self._asked(range(len(self._workers)), "finish", [None] * len(self._workers))
 
     def _did_again(self, what: str, found: dict[int, Any]) -> None:
         for i, answer in found.items():

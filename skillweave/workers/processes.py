@@ -228,7 +228,8 @@ def _described(what: str, task: Any) -> str:
     if what == "collect":
         return f"making {task.rows:,} steps in each of its environments"
     return {
-        "start": "resetting its environments",
+        "start": "resetting or checking its environments",
+        "finish": "checking its environments after training",
         "state": "sending the state of its environments",
         "restore": "playing its open episodes again",
         "train": "training its members of the population",
