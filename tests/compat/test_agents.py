@@ -218,6 +218,8 @@ def test_images_and_one_hot_states():
     agent = DQN([6], 3, True)
     assert agent.getAction(np.array([2, 5])).shape == (2,)
     assert PPO([6], 3, True, True).getAction(np.array([2, 5]))[3].shape == (2,)
+    # A loop of the user's own collects what is learnt from, so no rollout is reserved.
+    assert PPO([5_000], 3, True, True).getAction(np.array([2, 4_999]))[3].shape == (2,)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ class PPO(Agent):
     fixed: ClassVar[dict[str, Any]] = {
         "learning_rate_schedule": "constant",
         "num_envs": 1,
-        "n_steps": 1_000_000,  # learn() takes any number of steps
+        "n_steps": 65_536,  # learn() takes any number; this only limits batch_size
         "min_advantage_std": 0.0,  # AgileRL has no such limit
     }
     lr, gae_lambda, clip_coef = map(Setting, ("learning_rate", "gae_lambda", "clip_coef"))
