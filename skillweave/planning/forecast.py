@@ -2,10 +2,9 @@
 
 A plan without goals chooses among few skills, and follows any logged calls. One with goals chooses
 among many goals, and the best of them is often the luckiest: its own calls say too much good of it.
-So episodes of the log are split into halves; the goal is chosen by one, and the calls of the other
-are followed. Half a log chooses worse than the whole one, so both chances, the one that is too low
-and the one that is too high, are weighed as Efron (1983) weighs them in "Estimating the error rate
-of a prediction rule": .632 and .368.
+So episodes of the log are also split into halves: a goal is chosen by one, and the calls of the
+other are followed. They are fewer and farther away, and say too little good of it. The chance is
+the mean of both, and the interval reaches from the lower bound of these to the upper one of those.
 """
 
 from __future__ import annotations
@@ -33,8 +32,6 @@ from skillweave.types import Array
 EPISODES = 200
 GOALS = 16
 """Episodes where each has a goal of its own, which needs a plan of its own."""
-HELD_OUT = 0.632
-"""The weight of the chance by calls that the plan has not chosen by."""
 FEWEST_EPISODES = 4
 """Episodes of a log from which on its halves judge one another."""
 FOLLOWED = 5
@@ -214,8 +211,6 @@ class _Calls:
     def like(self, choice: int, obs: Array, aim: Array, rng: np.random.Generator) -> Array:
         """Return a piece of a call near by start and goal, (n,) int64; −1: none is near.
 
-        The call that has the goal itself is left out.
-
         Args:
             choice: the calls' choice.
             obs: (n, *obs_shape).
@@ -227,9 +222,6 @@ class _Calls:
             return np.full(len(obs), -1)
         calls = self._graph.pieces.call[rows]
         near, far = nearest(points, self._points(choice, obs, aim), EQUAL * FOLLOWED, calls)
-        far[calls[near] == aim[:, None]] = np.inf
-        order = far.argsort(axis=1, kind="stable")
-        near, far = (np.take_along_axis(x, order, 1) for x in (near, far))
         counts = (far <= far[:, FOLLOWED - 1, None] + SAME) & np.isfinite(far)
         counts &= far <= FAR * np.maximum(far[:, :1], usual)
         weights = np.where(counts, 1.0 / (far + SOFT), 0.0)
@@ -333,7 +325,7 @@ def _without_luck(
             halves.append(followed.chance(int((first & ~half).sum())))
     held_out = np.mean(halves, 0)
     low, high = _pooled(halves)
-    chance = HELD_OUT * held_out[0] + (1 - HELD_OUT) * whole[0]
+    chance = (held_out[0] + whole[0]) / 2
     return float(chance), min(low, chance), max(high, whole[2], chance)
 
 

@@ -45,7 +45,7 @@ ENOUGH_STATES = 256
 MOST_STATES = 3_000
 PIECE = 5
 """Steps of a piece, where that does not give too many."""
-MOST_PIECES = 10_000
+MOST_PIECES = 30_000
 """The most pieces of a graph; of a longer log they have more steps."""
 MOST_CALLS = 20_000
 """The most calls of a graph; of more, every so-many-th is used."""
@@ -264,7 +264,7 @@ class CallGraph:
             best = np.full_like(value, -np.inf)
             for c in options:
                 q = np.zeros_like(best)
-                for k in range(near.pieces.shape[2]):
+                for k in range(self.neighbors):
                     q += near.weights[:, c, k, None] * worth[near.pieces[:, c, k]]
                 q = np.where(q > 0, q * trust[:, c, None], q)
                 if novel is not None:

@@ -29,16 +29,6 @@ FURTHER = 2.0
 """A neighbor counts only if it is at most so many times as far as the nearest, or as is usual:
 where the log has few calls, others are often behind a wall, and a small chance to pass it would
 grow with each call that is tried again."""
-POOL = 128
-"""The nearest calls of a skill with goals by start, of which some give their goals to the options,
-and by which these are judged."""
-POOL_AHEAD = 4
-"""As ``AHEAD``, of a pool: the pool may be of somewhat fewer calls."""
-JUDGES = 15
-"""The calls that judge a goal, its own left out: by fewer, the best of many goals would be the
-luckiest."""
-FOR_EACH = 8
-"""Calls of a group for each one that judges: where it has few, so many would be far away."""
 MOST_OPTIONS = 10_000
 MOST_COUNTERS = 4
 
@@ -154,7 +144,6 @@ class OptionGroup:
         for name in ("rows", "call", "goal"):
             check(name, getattr(self, name), "iu", (len(self.starts),), -1 if name == "goal" else 0)
         self._squares = np.square(self.starts).sum(-1)
-        self._judges = min(JUDGES, len(np.unique(self.call)) // FOR_EACH)
 
     def near(
         self, to: Array, k: int, aims: Array | None, without: Array | None = None
@@ -162,51 +151,42 @@ class OptionGroup:
         """Return the nearest pieces to features ``to`` (n, F), however far they are.
 
         Args:
-            k: the fewest, each of another call; goals are judged by more where there are enough.
+            k: how many, each of another call.
             aims: (C, G) float32, the standardised goals of all calls; None: it has no goals.
             without: (n,) calls whose pieces do not count; None: all count.
 
         Returns:
-            Pieces (n, options, K), distances (n, options, K), infinite where there are fewer; and
+            Pieces (n, options, k), distances (n, options, k), infinite where there are fewer; and
             the calls whose goals the options have, (n, options), −1: none.
         """
-        n, several = len(to), self.options > 1
-        judges = max(k, self._judges) if several else k
-        pieces = np.zeros((n, self.options, judges), np.int64)
+        n, many = len(to), k if self.options == 1 else self.options
+        pieces = np.zeros((n, self.options, k), np.int64)
         far = np.full(pieces.shape, np.inf, np.float32)
         if not len(self.rows):
             return pieces, far, np.full(far.shape[:2], -1)
-        near, off = self._nearest(to, POOL if several else k, without)
-        if not several:
+        near, off = self._nearest(to, many, without)
+        goal = np.where(np.isfinite(off), self.goal[near], -1)[:, : self.options]
+        if self.options == 1:
             pieces[:, 0], far[:, 0] = self.rows[near], off
-            return pieces, far, np.where(np.isfinite(off), self.goal[near], -1)[:, :1]
+            return pieces, far, goal
         assert aims is not None
-        # Of every so-many-th call by start the goal is an option.
-        known = np.isfinite(off).sum(1, keepdims=True)
-        own = np.arange(self.options) * np.maximum(known, self.options) // self.options
-        goal = np.where(own < known, np.take_along_axis(self.goal[near], own, 1), -1)
-        for some in _blocks(n, self.options * POOL * max(1, aims.shape[1])):
-            goals, mine = aims[self.call[near[some]]], own[some, :, None]
-            wanted = np.take_along_axis(goals, mine, 1)
-            both = np.square(wanted[:, :, None] - goals[:, None]).sum(3)
-            both += np.square(off[some, None])  # (n, options, calls)
-            if judges > k:  # few calls cannot do without
-                np.put_along_axis(both, mine, np.inf, 2)
-            least = both.argpartition(judges - 1, axis=2)[:, :, :judges]
-            both = np.take_along_axis(both, least, 2)
-            order = both.argsort(axis=2, kind="stable")
-            far[some] = np.sqrt(np.take_along_axis(both, order, 2))
-            least = np.take_along_axis(least, order, 2)
-            pieces[some] = self.rows[np.take_along_axis(near[some, None], least, 2)]
-        far[goal < 0] = np.inf
+        for some in _blocks(n, many**2):
+            goals = aims[self.call[near[some]]]
+            apart = np.square(goals[:, :, None] - goals[:, None]).sum(3)
+            both = np.sqrt(off[some, None] ** 2 + apart)  # (n, options, calls)
+            least = np.argsort(both, axis=2, kind="stable")[:, :, :k]
+            most = least.shape[2]
+            far[some, :, :most] = np.take_along_axis(both, least, 2)
+            own = np.take_along_axis(near[some, None].repeat(many, 1), least, 2)
+            pieces[some, :, :most] = self.rows[own]
+        far[~np.isfinite(off)] = np.inf
         return pieces, far, goal
 
     def _nearest(self, to: Array, count: int, without: Array | None) -> tuple[Array, Array]:
         """Return the places of the nearest pieces, (n, count), and distances (n, count)."""
-        ahead = AHEAD if self.options == 1 else POOL_AHEAD
         if without is None:
-            return nearest(self.starts, to, count, self.call, self._squares, ahead)
-        near, far = nearest(self.starts, to, count + 1, self.call, self._squares, ahead)
+            return nearest(self.starts, to, count, self.call, self._squares)
+        near, far = nearest(self.starts, to, count + 1, self.call, self._squares)
         far[self.call[near] == without[:, None]] = np.inf
         order = np.argsort(far, axis=1, kind="stable")[:, :count]
         return np.take_along_axis(near, order, 1), np.take_along_axis(far, order, 1)
@@ -283,10 +263,7 @@ class Options:
             pieces, far, goal = group.near(to, self.neighbors, aims, without)
             limit = FURTHER * np.maximum(far[..., :1], np.float32(group.usual))
             found.append((pieces, np.where(far <= limit, far, np.float32(np.inf)), goal))
-        most = max(pieces.shape[2] for pieces, _, _ in found)
-        pieces = np.concatenate([_wide(each, most, 0) for each, _, _ in found], 1)
-        distance = np.concatenate([_wide(each, most, np.inf) for _, each, _ in found], 1)
-        goal = np.concatenate([each for _, _, each in found], 1)
+        pieces, distance, goal = (np.concatenate(part, 1) for part in zip(*found, strict=True))
         finite = np.where(np.isfinite(distance), distance, 1e9)
         total = (1.0 / (finite + SOFT)).sum(2)
         return Near(pieces, weights_of(finite), distance[:, :, 0], total, goal)
@@ -304,19 +281,8 @@ class Options:
         return share
 
 
-def _wide(x: Array, most: int, empty: float) -> Array:
-    """Return an array (n, options, k) as (n, options, most), with ``empty`` at the end."""
-    width = ((0, 0), (0, 0), (0, most - x.shape[2]))
-    return np.pad(x, width, constant_values=empty)
-
-
 def nearest(
-    points: Array,
-    to: Array,
-    count: int,
-    group: Array,
-    squares: Array | None = None,
-    ahead: int = AHEAD,
+    points: Array, to: Array, count: int, group: Array, squares: Array | None = None
 ) -> tuple[Array, Array]:
     """Return the ``count`` nearest points to each row of ``to``, each of another group.
 
@@ -326,13 +292,12 @@ def nearest(
         count: how many.
         group: (m,) the group of each point; of a group only the nearest point counts.
         squares: (m,) of the points' lengths, if they are known.
-        ahead: points that are looked at for each of ``count``.
 
     Returns:
         Their rows (n, count) int64, the nearest first, of equally near ones the first; and
         distances (n, count) float32. Where there are fewer groups, the distance is infinite.
     """
-    tries = min(len(points), count * ahead)
+    tries = min(len(points), count * AHEAD)
     if tries == len(points):
         near = np.broadcast_to(np.arange(tries), (len(to), tries))
     else:
