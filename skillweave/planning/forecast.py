@@ -252,7 +252,7 @@ def forecast(planner: Planner) -> Forecast:
     low, high = 0.0, 1.0
     if machine.accepting.any():
         chance, low, high = whole.chance(starts)
-        if any(group.options > 1 for group in planner.graph.options.groups):
+        if planner.log.goals:
             chance, low, high = _without_luck(planner, (chance, low, high), rng)
         if planner.obstacle:
             low, high = (float(x) for x in wilson(0.0, min(EPISODES, starts)))
