@@ -32,7 +32,7 @@ from skillweave.errors import EnvError, SkillweaveError, reworded
 from skillweave.policies.infos import InfoKeys, batched_infos
 from skillweave.policies.spaces import space_of
 from skillweave.skills.outputs import keys_of
-from skillweave.spaces import obs_dtype, obs_shape, put_observation
+from skillweave.spaces import leaves, obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, Step
 
 OWN_GENERATOR = "self.np_random instead, which super().reset(seed=seed) seeds"
@@ -362,7 +362,7 @@ class GymnasiumEngine(WatchedEngine):
 
     def numbers(self, obs: Array) -> list[Array]:
         """Return copies of observations (n, …) as arrays of numbers."""
-        return [part.copy() for part in _parts(obs)]
+        return [part.copy() for part in leaves(obs)]
 
     def renew(self) -> None:
         """Close the environments, and make a new one in their place: no more may exist at once."""
@@ -432,14 +432,7 @@ def episode_seed(root: int, row: int, episode: int) -> int:
 def checksums(obs: Array) -> Array:
     """Return a checksum for each row of observations (n, *obs_shape), (n,) int64."""
     sums = [0] * len(obs)
-    for part in _parts(obs):
+    for part in leaves(obs):
         rows = (np.ascontiguousarray(row).tobytes() for row in part)
         sums = [zlib.crc32(row, before) for row, before in zip(rows, sums, strict=True)]
     return np.array(sums, np.int64)
-
-
-def _parts(obs: Array) -> list[Array]:
-    """Return observations (n, …) as arrays of numbers, without the gaps between aligned parts."""
-    if obs.dtype.names is None:
-        return [obs]
-    return [part for name in obs.dtype.names for part in _parts(obs[name])]
