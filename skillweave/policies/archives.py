@@ -76,9 +76,9 @@ def numbers_in(content: bytes) -> Array:
 
 
 def _array(content: bytes) -> Array:
-    # NumPy takes the memory of the shape before it reads, but touches what it has read alone.
+    # It refuses objects. It takes the memory of the shape first, but touches only what it has read.
     stream = io.BytesIO(content)
-    array: Array = np.lib.format.read_array(stream, allow_pickle=False)
+    array: Array = np.lib.format.read_array(stream)
     if not _is_plain(array.dtype):
         raise PolicyError(f"it is {shown(str(array.dtype))}, no array of numbers")
     if stream.read(1):
