@@ -21,7 +21,7 @@ import torch
 import skillweave as sw
 from benchmarks.common import median, report, table
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.hierarchy.fitting import ready_policies
 from skillweave.hierarchy.roles import roles_of
 from skillweave.skills.goal_spaces import with_goal

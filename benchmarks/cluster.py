@@ -321,7 +321,7 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
     import ray
 
     from skillweave._internal.seeding import Seeds
-    from skillweave.algorithms.policy import make_algorithm
+    from skillweave.algorithms.agent_policy import make_algorithm
     from skillweave.experience.acting import Acting
     from skillweave.training.learner import RolloutLearner, Stack
     from skillweave.training.learning_task import skill_task

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from skillweave.cli.processes import Processes
+from skillweave.cli.jobs import Processes
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.errors import SkillweaveError
 from skillweave.types import Array

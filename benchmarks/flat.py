@@ -15,7 +15,7 @@ from benchmarks.bare import train_bare
 from benchmarks.common import median, report, table, warm_up
 from skillweave import recipes
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.training.episodes import Tick
 from skillweave.training.evaluation import evaluate
 from skillweave.training.learner import Stack

@@ -52,9 +52,9 @@ from skillweave import (
     TrainDefaults,
 )
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.batches import Batch
 from skillweave.algorithms.config import AlgorithmConfig
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.envs.engine import RawStep
 from skillweave.experience.acting import Acting, Request
 from skillweave.experience.collector import Collector

@@ -24,7 +24,7 @@ import torch
 import skillweave as sw
 from benchmarks.common import median, report, table
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.experience.acting import Acting, Request
 from skillweave.experience.learners import Calling
 from skillweave.hierarchy.policy import HierarchyPolicy

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
         train_agent as train_agent,
     )
     from skillweave.api.loading import from_hub as from_hub, load as load
-    from skillweave.api.options import make_options_env as make_options_env
+    from skillweave.api.make_options import make_options_env as make_options_env
     from skillweave.api.player import Player as Player
     from skillweave.api.policies import load_policy as load_policy, save_policy as save_policy
     from skillweave.envs.make import EnvSpec as EnvSpec

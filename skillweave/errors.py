@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from skillweave._internal.tracebacks import ShortTraceback
-from skillweave.policies.errors import (
+from skillweave.policies.acting_errors import (
     DeclarationError as DeclarationError,
     PolicyError as PolicyError,
     RunError as RunError,

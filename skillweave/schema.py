@@ -33,7 +33,7 @@ import numpy as np
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, suggest
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
-from skillweave.policies.files import shown
+from skillweave.policies.untrusted import shown
 
 C = TypeVar("C", bound=type[Any])
 

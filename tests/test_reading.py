@@ -12,7 +12,7 @@ import pytest
 from skillweave.algorithms.config import DQN, PPO, config_from_json, config_to_json
 from skillweave.errors import RunError
 from skillweave.evolution.config import Evolution, evolution_from_json, evolution_to_json
-from skillweave.policies.files import DEEPEST, check_file, parse_json, read_file, shown
+from skillweave.policies.untrusted import DEEPEST, check_file, parse_json, read_file, shown
 from skillweave.schema import LARGEST, AtLeastOne, Count, fit, fitted
 
 

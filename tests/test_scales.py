@@ -12,7 +12,7 @@ import skillweave
 from skillweave._internal.notices import collected_notices
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import config
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.ops.moments import explained_variance, merge_moments, normalize, scale_of
 from skillweave.planning.neighbors import FeatureMap, Standard

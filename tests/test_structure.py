@@ -91,13 +91,13 @@ ROOMS: dict[str, set[str]] = {
 SETTINGS = {"errors", "types", "messages", "schema", "named"}
 LEAVES: dict[str, set[str]] = {
     "networks.config": SETTINGS,
-    "schema": {"errors", "types", "messages", "arguments", "policies.files"},
+    "schema": {"errors", "types", "messages", "arguments", "policies.untrusted"},
     "algorithms.schedules": SETTINGS,
     "algorithms.config": SETTINGS
-    | {"policies.files", "networks.config", "algorithms.schedules"}
+    | {"policies.untrusted", "networks.config", "algorithms.schedules"}
     | {"spaces.action_codec"},  # where it is called, as it needs torch
     "evolution.config": SETTINGS
-    | {"policies.files", "networks.config", "algorithms.config", "algorithms.schedules"},
+    | {"policies.untrusted", "networks.config", "algorithms.config", "algorithms.schedules"},
 }
 
 
@@ -327,3 +327,27 @@ def test_a_name_that_is_elsewhere_is_found_there():
                 getattr(import_module("skillweave"), name)
     with pytest.raises(AttributeError, match=r"no attribute 'PPO': it is in skillweave$"):
         _ = import_module("skillweave.algorithms").PPO
+
+
+# Rules of names that stand in several files; docs/architecture.md explains them.
+MIRRORED = "compat/agilerl/"  # AgileRL's own names of classes and files
+SAME_FILES = {"__init__.py", "config.py", "base.py"}  # the settings, the base class of a room
+SAME_CLASSES = {"State"}  # of each algorithm
+
+
+def test_a_name_of_a_class_or_file_has_one_meaning() -> None:
+    """But those of the importer, and files that act what one of the same name declares."""
+    classes: dict[str, set[str]] = {}
+    files: dict[str, set[str]] = {}
+    for path in MODULES:
+        place = path.relative_to(ROOT).as_posix()
+        if place.startswith(MIRRORED):
+            continue
+        files.setdefault(path.name, set()).add(place)
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                classes.setdefault(node.name, set()).add(place)
+    mapped = {"policies/mapped.py", "skills/mapped.py"}
+    assert {k: v for k, v in classes.items() if len(v) > 1 and k not in SAME_CLASSES} == {}
+    several = {k: v for k, v in files.items() if len(v) > 1 and k not in SAME_FILES}
+    assert {k: v for k, v in several.items() if v != mapped} == {}

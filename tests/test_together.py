@@ -29,7 +29,7 @@ from small_runs import (
 )
 
 from skillweave import SAC, EnvSpec, Hierarchy, Lengths, Skill, SkillweaveError, Together
-from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.api.applying import differences
 from skillweave.evolution import Evolution, Mutations
 from skillweave.hierarchy import select_best, training

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.batches import Rollout, Sample
 from skillweave.algorithms.config import PPO, AlgorithmConfig
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.envs.engine import RawStep
 from skillweave.experience.acting import Acting
 from skillweave.experience.collector import Collector
@@ -34,7 +34,7 @@ from skillweave.skills.skill_set import SkillSet
 from skillweave.spaces import pack
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Learner, Stack
-from skillweave.training.loop import Loop, Progress, Saved
+from skillweave.training.loop import Loop, LoopState, Saved
 from skillweave.training.replay_learner import ReplayLearner, learner_of, store_of
 from skillweave.types import Array
 
@@ -537,11 +537,11 @@ class Training:
         """Of its only stack."""
         return self.learner.stacks[0].state
 
-    def run(self, budget: int, **how: Any) -> Progress:
+    def run(self, budget: int, **how: Any) -> LoopState:
         """Train it by a ``Loop``."""
         return Loop(self.learner, self.collectors, self.episodes, self.seeds, budget, **how).run()
 
-    def resume(self, extra: dict[str, Any], at: Progress) -> Array:
+    def resume(self, extra: dict[str, Any], at: LoopState) -> Array:
         """Stand where a checkpoint was written, at these steps."""
         parts = self.learner, self.collectors, self.episodes, self.seeds
         return Loop(*parts, at.steps, at).restore(extra)
@@ -636,7 +636,7 @@ def goes_on(
 
     def resumed(extra: dict[str, Any]) -> Training:
         at, state = saved[1].at, copied(states[1])
-        now = Progress(at.update, at.steps)
+        now = LoopState(at.update, at.steps)
         found = training(algorithm, make(), state=state, goes_on_at=at.steps)
         assert not len(found.resume(extra, now))
         found.run(budget, at=now, on_checkpoint=lambda saved: None, **how)

@@ -42,10 +42,10 @@ from skillweave import (
     Skill,
     from_onnx,
 )
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.api import Agent, Run, train_agent
 from skillweave.cli import commands, execute
-from skillweave.compat.agilerl import agents
+from skillweave.compat.agilerl import agent_classes
 from skillweave.compat.agilerl_files import convert
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
@@ -110,7 +110,7 @@ def plays(policy: Policy) -> Play:
 def looked_at(run: Path, changed: str) -> None:
     """Run the commands that only read."""
     with contextlib.redirect_stdout(io.StringIO()):
-        execute.run(commands.Info(target=str(run)))
+        execute.run(commands.InfoCommand(target=str(run)))
     found = RunDirectory.open(run)
     if changed.endswith(".jsonl"):
         list(found.metrics())
@@ -165,14 +165,16 @@ def flat_weights(folder: Path, changed: str) -> Play:
     """Score a flat agent's weights on the command line."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
-        execute.run(commands.Evaluate(target=str(folder / "w.safetensors"), episodes=1, json=True))
+        execute.run(
+            commands.EvaluateCommand(target=str(folder / "w.safetensors"), episodes=1, json=True)
+        )
     return {"printed": out.getvalue().replace(str(folder), "")}
 
 
 def converted(folder: Path, changed: str) -> Play:
     """Convert a checkpoint of AgileRL's, and load the result."""
     convert(folder / "old.pt", folder / "new.safetensors")
-    agent = agents.PPO.load(folder / "new.safetensors")
+    agent = agent_classes.PPO.load(folder / "new.safetensors")
     about = agent.scores, agent.fitness, agent.steps, agent.index
     return plays(AgentPolicy.of(agent.learner, agent.member.state)) | {"about": repr(about)}
 

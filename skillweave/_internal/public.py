@@ -12,7 +12,7 @@ PUBLIC = {
         "algorithms.schedules": "Linear",
         "api": "Agent Hierarchy Run train_agent",
         "api.loading": "from_hub load",
-        "api.options": "make_options_env",
+        "api.make_options": "make_options_env",
         "api.player": "Player",
         "api.policies": "load_policy save_policy",
         "workers.cluster": "Ray",
@@ -48,11 +48,11 @@ PUBLIC = {
     },
     "skillweave.envs": {
         "envs.pool": "PoolWrapper one_of",
-        "hierarchy.options": "OptionsEnv",
+        "hierarchy.options_env": "OptionsEnv",
     },
     "skillweave.errors": {
         "errors": "EnvError Interrupted MissingExtra TrainingError",
-        "policies.errors": "DeclarationError PolicyError RunError SkillError",
+        "policies.acting_errors": "DeclarationError PolicyError RunError SkillError",
     },
     "skillweave.evolution": {
         "evolution.config": "Evolution Mutations Range Tournament Truncation",

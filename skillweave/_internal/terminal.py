@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from skillweave.policies.errors import RunError, printable as printable
+from skillweave.policies.acting_errors import RunError, printable as printable
 
 STANDARD = (0, 1, 2)
 """Numbers of the standard streams."""

@@ -17,7 +17,7 @@ from skillweave._internal.named import Named
 from skillweave.algorithms.schedules import LearningRate, check_rate
 from skillweave.errors import DeclarationError, EnvError, RunError
 from skillweave.networks.config import Network, check_critic
-from skillweave.policies.files import shown
+from skillweave.policies.untrusted import shown
 from skillweave.schema import (
     Amount,
     AtLeastOne,

@@ -18,15 +18,13 @@ from skillweave._internal.notices import notice
 from skillweave._internal.paths import AGENT, join, level_of, name_of
 from skillweave._internal.shipped import weights_path
 from skillweave._internal.terminal import printable
+from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy
 from skillweave.algorithms.config import PPO, AlgorithmConfig, config_from_json
-from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.api.applying import (
     Trained,
     load_policy,
     spec_of,
 )
-from skillweave.api.calls import RunCalls
-from skillweave.api.hub import push_run
 from skillweave.api.notebook_tables import declared_html, declared_line, run_html
 from skillweave.api.planning import (
     mission_words,
@@ -36,8 +34,10 @@ from skillweave.api.planning import (
     untasked,
 )
 from skillweave.api.player import Player
+from skillweave.api.push_pull import push_run
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.repairing import repair
+from skillweave.api.run_calls import RunCalls
 from skillweave.api.running import resume, train
 from skillweave.api.train_options import (
     AgentOptions,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from skillweave._internal.notices import notice
-from skillweave.algorithms.policy import AgentHeader
+from skillweave.algorithms.agent_policy import AgentHeader
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
 from skillweave.hierarchy import training

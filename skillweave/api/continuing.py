@@ -9,7 +9,7 @@ from typing import Any
 from skillweave._internal.paths import decides, is_below, level_of
 from skillweave.api.applying import D, apply_manifest, differences
 from skillweave.errors import RunError
-from skillweave.evolution.plan import Evolve, plan
+from skillweave.evolution.evolving import Evolve, plan
 from skillweave.runs.command_words import from_command_line, start_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub

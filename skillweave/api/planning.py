@@ -17,7 +17,7 @@ from skillweave.algorithms.config import PPO
 from skillweave.api.task_views import OwnSelector, own_skills
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
-from skillweave.experience.calls import as_logits
+from skillweave.experience.decisions import as_logits
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.settings import Guide, Selection

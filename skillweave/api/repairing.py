@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 from skillweave._internal.messages import as_path, short, shown_path
 from skillweave._internal.paths import join, level_of, name_of
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.config import OnPolicy, config_to_json
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.applying import Trained, apply_manifest
 from skillweave.api.planning import lacking_features
 from skillweave.api.running import begin, go_on

@@ -23,7 +23,7 @@ from skillweave.api.starting import starts
 from skillweave.api.train_options import AgentOptions, Going, ResumeOptions, TrainOptions
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, Interrupted, RunError
-from skillweave.evolution.plan import check_several, make_learner, plan
+from skillweave.evolution.evolving import check_several, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.roles import Level, roles_of

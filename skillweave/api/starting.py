@@ -13,11 +13,11 @@ from skillweave._internal.messages import as_path, short, suggest
 from skillweave._internal.notices import notice
 from skillweave._internal.paths import AGENT, decides
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.policies.files import shown
+from skillweave.policies.untrusted import shown
 from skillweave.runs.initial_policies import (
     Chooses,
     Learnt,

@@ -20,7 +20,7 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.api.starting import StartFrom
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
-from skillweave.evolution.plan import Evolve
+from skillweave.evolution.evolving import Evolve
 from skillweave.runs.manifest import Manifest
 from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.training.callback import Callback, check_callback

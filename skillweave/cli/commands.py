@@ -64,7 +64,7 @@ class Loaded(Coded):
 
 
 @dataclass(frozen=True)
-class Played(Output):
+class OfEpisodes(Output):
     """A command that plays episodes."""
 
     seed: int = 0
@@ -83,7 +83,7 @@ class OnRay(Output):
 
 
 @dataclass(frozen=True)
-class Train(OnRay, Continuing, Starting):
+class TrainCommand(OnRay, Continuing, Starting):
     """Train a recipe: every skill, then the selector."""
 
     recipe: Positional[str] = tyro.MISSING
@@ -121,7 +121,7 @@ class Train(OnRay, Continuing, Starting):
 
 
 @dataclass(frozen=True)
-class Demo(Output):
+class DemoCommand(Output):
     """Train, score and film two tasks in three minutes: where skills pay, and where not."""
 
     out: Out = Path("runs/demo")
@@ -133,7 +133,7 @@ class Demo(Output):
 
 
 @dataclass(frozen=True)
-class Resume(OnRay, Coded, OfRun, Continuing):
+class ResumeCommand(OnRay, Coded, OfRun, Continuing):
     """Finish a run that was stopped; the end is the same as if it had not been."""
 
     evaluate: int = 100
@@ -141,7 +141,7 @@ class Resume(OnRay, Coded, OfRun, Continuing):
 
 
 @dataclass(frozen=True)
-class Sweep(OnRay):
+class SweepCommand(OnRay):
     """Train a recipe with many seeds and settings; what is finished is not trained again."""
 
     recipe: Positional[str] = tyro.MISSING
@@ -167,7 +167,7 @@ class Sweep(OnRay):
 
 
 @dataclass(frozen=True)
-class Watched(Played, Loaded):
+class Watched(OfEpisodes, Loaded):
     """A command that loads a policy and lets it act."""
 
     skill: str | None = None
@@ -177,7 +177,7 @@ class Watched(Played, Loaded):
 
 
 @dataclass(frozen=True)
-class Evaluate(Watched):
+class EvaluateCommand(Watched):
     """Score a policy on Gymnasium's environment."""
 
     episodes: int = 100
@@ -187,7 +187,7 @@ class Evaluate(Watched):
 
 
 @dataclass(frozen=True)
-class Render(Watched):
+class RenderCommand(Watched):
     """Write a captioned GIF or MP4."""
 
     out: MaybeOut = None
@@ -197,7 +197,7 @@ class Render(Watched):
 
 
 @dataclass(frozen=True)
-class Log(Coded, OfRun):
+class LogCommand(Coded, OfRun):
     """Let a run's skills act, and record their calls in the run: for info, report and plan."""
 
     steps: int = 20_000
@@ -211,7 +211,7 @@ class Log(Coded, OfRun):
 
 
 @dataclass(frozen=True)
-class Plan(Loaded):
+class PlanCommand(Loaded):
     """Plan a new mission on a run's recorded calls, and score it; nothing is trained."""
 
     target: Positional[str] = tyro.MISSING
@@ -230,7 +230,7 @@ class Plan(Loaded):
 
 
 @dataclass(frozen=True)
-class Plot(Output):
+class PlotCommand(Output):
     """Draw learning curves as PNG and SVG: of one run, or of many seeds with bands, for a paper.
 
     Of one run: how each agent learnt, or how its population evolved.
@@ -254,7 +254,7 @@ class Plot(Output):
 
 
 @dataclass(frozen=True)
-class Report(Played, Coded, OfRun):
+class ReportCommand(OfEpisodes, Coded, OfRun):
     """Write one HTML file about a run: film, timeline of calls, curves, skills, settings."""
 
     out: MaybeOut = None
@@ -266,7 +266,7 @@ class Report(Played, Coded, OfRun):
 
 
 @dataclass(frozen=True)
-class Compare(Output):
+class CompareCommand(Output):
     """Write one HTML file that compares runs; those that differ by their seed alone are a group."""
 
     runs: Runs = tyro.MISSING
@@ -276,12 +276,12 @@ class Compare(Output):
 
 
 @dataclass(frozen=True)
-class List(Output):
+class ListCommand(Output):
     """List the shipped recipes, and the runs under ./runs."""
 
 
 @dataclass(frozen=True)
-class Info(Output):
+class InfoCommand(Output):
     """Show what a run holds, or a recipe's settings."""
 
     target: Positional[str] = tyro.MISSING
@@ -289,7 +289,7 @@ class Info(Output):
 
 
 @dataclass(frozen=True)
-class Weights(Coded, OfRun):
+class WeightsCommand(Coded, OfRun):
     """Write a run's policies into one weights file."""
 
     out: Out = Path("weights.safetensors")
@@ -297,7 +297,7 @@ class Weights(Coded, OfRun):
 
 
 @dataclass(frozen=True)
-class Export(Loaded):
+class ExportCommand(Loaded):
     """Write a policy for machines without this library: ONNX files and a runner of one file."""
 
     onnx: bool = False
@@ -307,7 +307,7 @@ class Export(Loaded):
 
 
 @dataclass(frozen=True)
-class Push(OfRun):
+class PushCommand(OfRun):
     """Put a finished run on the Hugging Face Hub, with a page about it."""
 
     name: Positional[str] = tyro.MISSING
@@ -319,7 +319,7 @@ class Push(OfRun):
 
 
 @dataclass(frozen=True)
-class Pull(Output):
+class PullCommand(Output):
     """Copy a run from the Hugging Face Hub into a new folder."""
 
     name: Positional[str] = tyro.MISSING
@@ -331,7 +331,7 @@ class Pull(Output):
 
 
 @dataclass(frozen=True)
-class ImportAgilerl(Output):
+class ImportAgilerlCommand(Output):
     """Convert a checkpoint of AgileRL 0.1 or 1.0, which is a pickle."""
 
     file: Positional[Path] = tyro.MISSING
@@ -343,27 +343,27 @@ class ImportAgilerl(Output):
 
 
 COMMANDS = (
-    Demo,
-    Train,
-    Resume,
-    Sweep,
-    Evaluate,
-    Render,
-    Log,
-    Plan,
-    Plot,
-    Report,
-    Compare,
-    List,
-    Info,
-    Weights,
-    Export,
-    Push,
-    Pull,
-    ImportAgilerl,
+    DemoCommand,
+    TrainCommand,
+    ResumeCommand,
+    SweepCommand,
+    EvaluateCommand,
+    RenderCommand,
+    LogCommand,
+    PlanCommand,
+    PlotCommand,
+    ReportCommand,
+    CompareCommand,
+    ListCommand,
+    InfoCommand,
+    WeightsCommand,
+    ExportCommand,
+    PushCommand,
+    PullCommand,
+    ImportAgilerlCommand,
 )
 
 
 def name_of(command: type) -> str:
-    """Return the name of a command: import-agilerl for ImportAgilerl."""
-    return re.sub(r"(?<!^)(?=[A-Z])", "-", command.__name__).lower()
+    """Return the name of a command: import-agilerl for ImportAgilerlCommand."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "-", command.__name__.removesuffix("Command")).lower()

@@ -42,7 +42,7 @@ class Demo:
         command: as it was given.
     """
 
-    command: commands.Demo
+    command: commands.DemoCommand
     result: dict[str, Any] = field(default_factory=dict)
     """Everything as data, for ``--json``."""
     quoted: dict[str, dict[str, Any]] = field(
@@ -162,7 +162,7 @@ def complete(score: Evaluation) -> float:
     return sum(one > COMPLETE for one in score.returns) / len(score.returns)
 
 
-def demo(command: commands.Demo) -> Result:
+def demo(command: commands.DemoCommand) -> Result:
     """Run the demonstration.
 
     Raises:

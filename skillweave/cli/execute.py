@@ -15,16 +15,16 @@ from skillweave._internal.messages import as_path
 from skillweave._internal.notices import notice
 from skillweave._internal.terminal import one_line, say
 from skillweave.api import Agent, Hierarchy, Run, info_json
-from skillweave.api.hub import pull_run, push_run
 from skillweave.api.loading import declared_in, load_from
 from skillweave.api.planning import lacking_features, mission_words
+from skillweave.api.push_pull import pull_run, push_run
 from skillweave.api.recipe_file import is_env_id
 from skillweave.cli import commands
 from skillweave.cli.demo import demo
 from skillweave.cli.output import Result, run_words, save_score
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.sweep import sweep
-from skillweave.cli.training import resume, train
+from skillweave.cli.training_commands import resume, train
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy.recorded import calls_of
 from skillweave.hierarchy.weights import HierarchyHeader, open_weights
@@ -51,7 +51,7 @@ def run(command: commands.Output) -> Result:
     return WAYS[type(command)](command)
 
 
-def _evaluate(command: commands.Evaluate) -> Result:
+def _evaluate(command: commands.EvaluateCommand) -> Result:
     trained = _load_target(command)
     score = trained.evaluate(
         command.episodes,
@@ -81,7 +81,7 @@ def _goal(command: commands.Watched) -> Any:
         ) from error
 
 
-def _render(command: commands.Render) -> Result:
+def _render(command: commands.RenderCommand) -> Result:
     trained = _load_target(command)
     path = command.out or Path(f"{Path(command.target).name.removesuffix('.safetensors')}.gif")
     result = trained.render(
@@ -97,7 +97,7 @@ def _render(command: commands.Render) -> Result:
     return result, f"{result['path']}: {result['frames']} frames, return {returns}"
 
 
-def _log(command: commands.Log) -> Result:
+def _log(command: commands.LogCommand) -> Result:
     run = _load_with_code(command.run, command.recipe)
     if words := lacking_features(run.hierarchy, run.policy):
         notice(words)
@@ -117,7 +117,7 @@ def _log(command: commands.Log) -> Result:
     return result, "\n".join([text, *_handover_lines(matrix)])
 
 
-def _plan(command: commands.Plan) -> Result:
+def _plan(command: commands.PlanCommand) -> Result:
     path = Path(command.target)
     if path.is_dir() and not command.pretrained:
         run = _load_with_code(path, command.recipe)
@@ -144,7 +144,7 @@ def _plan(command: commands.Plan) -> Result:
     return result, text
 
 
-def _plot(command: commands.Plot) -> Result:
+def _plot(command: commands.PlotCommand) -> Result:
     runs = open_runs(command.runs)
     of_several = (command.metric, command.agent, *command.label)
     if len(runs) == 1 and all(word is None for word in of_several) and command.band == "iqr":
@@ -168,7 +168,7 @@ def _plot(command: commands.Plot) -> Result:
     return result, "\n".join([*map(str, figure.paths), figure.caption])
 
 
-def _report(command: commands.Report) -> Result:
+def _report(command: commands.ReportCommand) -> Result:
     run = RunDirectory.open(command.run)
     why_not = None
     trained = None
@@ -194,7 +194,7 @@ def _report(command: commands.Report) -> Result:
     return _about(page)
 
 
-def _compare(command: commands.Compare) -> Result:
+def _compare(command: commands.CompareCommand) -> Result:
     return _about(write_comparison(open_runs(command.runs), command.out))
 
 
@@ -206,7 +206,7 @@ def _about(page: dict[str, Any]) -> Result:
     return page, "\n".join(lines)
 
 
-def _list(command: commands.List) -> Result:
+def _list(command: commands.ListCommand) -> Result:
     shipped = []
     for name in recipes.names():
         weights = (recipes.source(name).with_suffix(".safetensors")).exists()
@@ -234,7 +234,7 @@ def _run_line(path: Path) -> dict[str, Any]:
     }
 
 
-def _info(command: commands.Info) -> Result:
+def _info(command: commands.InfoCommand) -> Result:
     if not (Path(command.target) / "run.json").exists() and not Path(command.target).is_dir():
         settings = list_settings(recipes.load(command.target))
         text = "\n".join(f"{k}={v}" for k, v in settings.items())
@@ -309,13 +309,13 @@ def run_lines(manifest: Manifest, saved: Iterable[SavedEvaluation], target: obje
     return lines
 
 
-def _weights(command: commands.Weights) -> Result:
+def _weights(command: commands.WeightsCommand) -> Result:
     trained = load_from(command.run, recipe=command.recipe)
     path = trained.save_weights(command.out)
     return {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}"
 
 
-def _export(command: commands.Export) -> Result:
+def _export(command: commands.ExportCommand) -> Result:
     if not command.onnx:
         raise DeclarationError("choose an export format: --onnx")
     name = Path(command.target).name.removesuffix(".safetensors")
@@ -324,7 +324,7 @@ def _export(command: commands.Export) -> Result:
     return result, str(export)
 
 
-def _push(command: commands.Push) -> Result:
+def _push(command: commands.PushCommand) -> Result:
     _no_bars()
     pushed = push_run(command.run, command.name, command.private, command.calls)
     lines = [f"{pushed['url']}: {len(pushed['files'])} files", *pushed["missing"]]
@@ -332,7 +332,7 @@ def _push(command: commands.Push) -> Result:
     return pushed, "\n".join(lines)
 
 
-def _pull(command: commands.Pull) -> Result:
+def _pull(command: commands.PullCommand) -> Result:
     _no_bars()
     name = PurePosixPath(check_name(command.name)).name
     path = pull_run(command.name, command.out or _free_path(Path("runs") / name), command.revision)
@@ -355,7 +355,7 @@ def _no_bars() -> None:
     importlib.import_module("huggingface_hub.utils").disable_progress_bars()
 
 
-def _import_agilerl(command: commands.ImportAgilerl) -> Result:
+def _import_agilerl(command: commands.ImportAgilerlCommand) -> Result:
     if not command.trust:
         raise DeclarationError(
             f"{command.file} would be read as a pickle, and pickles can run code. This one is read "
@@ -374,7 +374,7 @@ def _import_agilerl(command: commands.ImportAgilerl) -> Result:
 # Policies that commands name
 
 
-def _load_target(command: commands.Watched | commands.Export | commands.Plan) -> Run:
+def _load_target(command: commands.Watched | commands.ExportCommand | commands.PlanCommand) -> Run:
     """Return the trained policy that a command names.
 
     Raises:
@@ -425,23 +425,23 @@ def _shipped(run: RunDirectory) -> str | None:
 
 
 WAYS: dict[type, Callable[[Any], Result]] = {
-    commands.Demo: demo,
-    commands.Train: train,
-    commands.Resume: resume,
-    commands.Sweep: sweep,
-    commands.Evaluate: _evaluate,
-    commands.Render: _render,
-    commands.Log: _log,
-    commands.Plan: _plan,
-    commands.Plot: _plot,
-    commands.Report: _report,
-    commands.Compare: _compare,
-    commands.List: _list,
-    commands.Info: _info,
-    commands.Weights: _weights,
-    commands.Export: _export,
-    commands.Push: _push,
-    commands.Pull: _pull,
-    commands.ImportAgilerl: _import_agilerl,
+    commands.DemoCommand: demo,
+    commands.TrainCommand: train,
+    commands.ResumeCommand: resume,
+    commands.SweepCommand: sweep,
+    commands.EvaluateCommand: _evaluate,
+    commands.RenderCommand: _render,
+    commands.LogCommand: _log,
+    commands.PlanCommand: _plan,
+    commands.PlotCommand: _plot,
+    commands.ReportCommand: _report,
+    commands.CompareCommand: _compare,
+    commands.ListCommand: _list,
+    commands.InfoCommand: _info,
+    commands.WeightsCommand: _weights,
+    commands.ExportCommand: _export,
+    commands.PushCommand: _push,
+    commands.PullCommand: _pull,
+    commands.ImportAgilerlCommand: _import_agilerl,
 }
 """By command, the function that carries it out."""

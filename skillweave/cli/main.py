@@ -22,7 +22,7 @@ from skillweave._internal.terminal import (
     say,
     steady_streams,
 )
-from skillweave.policies.errors import RunError
+from skillweave.policies.acting_errors import RunError
 
 Put = Callable[[str], None]
 """A function that writes a command's result."""

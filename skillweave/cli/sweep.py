@@ -31,13 +31,13 @@ from skillweave.api.loading import finish
 from skillweave.api.recipe_file import imported
 from skillweave.api.running import begun
 from skillweave.cli import commands
+from skillweave.cli.jobs import ProcessEnded, Processes
 from skillweave.cli.output import Result
 from skillweave.cli.overrides import apply_overrides
-from skillweave.cli.processes import ProcessEnded, Processes
 from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy import training
-from skillweave.policies.files import shown
+from skillweave.policies.untrusted import shown
 from skillweave.reporting.report.groups import over_seeds
 from skillweave.runs.files import read_json, write_json
 from skillweave.runs.manifest import Manifest
@@ -103,7 +103,7 @@ class Job:
         return training.manifest(hierarchy, seed=self.seed, flat=self.flat)
 
 
-def sweep(command: commands.Sweep) -> Result:
+def sweep(command: commands.SweepCommand) -> Result:
     """Train all runs of a sweep; return the results as JSON and for people."""
     fitted(AtLeastOne, command.evaluate, "evaluate")
     fitted(AtLeastOne | None, command.jobs, "jobs")
@@ -186,7 +186,7 @@ def parse_choices(each: Sequence[str]) -> list[tuple[str, ...]]:
 
 
 def _hierarchies(
-    command: commands.Sweep, choices: Sequence[tuple[str, ...]]
+    command: commands.SweepCommand, choices: Sequence[tuple[str, ...]]
 ) -> Iterator[tuple[str, Hierarchy]]:
     """Yield for each choice its name, and the hierarchy with these settings."""
     for choice in choices:
@@ -207,7 +207,9 @@ def _file_name(settings: str, seed: int) -> str:
 Tasks = Sequence[tuple[bytes, Job]]
 
 
-def _in_processes(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float | str]]:
+def _in_processes(
+    tasks: Tasks, command: commands.SweepCommand
+) -> Iterator[tuple[Job, float | str]]:
     """Do each run in a process of its own, as many at once as there are cores."""
     with Processes(min(command.jobs or cores(), len(tasks))) as pool:
         due = {pool.submit(job.run, code): job for code, job in tasks}
@@ -219,7 +221,7 @@ def _in_processes(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, 
                 yield due[future], message
 
 
-def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float | str]]:
+def _on_ray(tasks: Tasks, command: commands.SweepCommand) -> Iterator[tuple[Job, float | str]]:
     """Do each run as a task of Ray; one whose machine is lost continues on another."""
     cluster = Ray(address=command.ray or None)
     with cluster.joined(command.jobs or cores()) as ray:

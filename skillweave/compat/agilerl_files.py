@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.policy import make_algorithm
-from skillweave.compat.agilerl.agent import Agent, network_of, observations_of
-from skillweave.compat.agilerl.agents import DQN, KINDS, PPO, TD3
+from skillweave.algorithms.agent_policy import make_algorithm
+from skillweave.compat.agilerl.agent import AgilerlAgent, network_of, observations_of
+from skillweave.compat.agilerl.agent_classes import DQN, KINDS, PPO, TD3
 from skillweave.compat.pickles import read_torch_pickle
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.evolution.stacks import Member
 from skillweave.networks.config import Network
-from skillweave.policies.files import shown
+from skillweave.policies.untrusted import shown
 from skillweave.schema import AtLeastOne, Check, fit
 
 _OUTPUTS = {"PPO": "Softmax", "DQN": None, "DDPG": "Tanh", "TD3": "Tanh"}
@@ -105,7 +105,7 @@ class _Checkpoint(TypedDict):
     policy_freq: NotRequired[AtLeastOne]
 
 
-def _agent(kind: Any, data: Mapping[str, Any]) -> Agent:
+def _agent(kind: Any, data: Mapping[str, Any]) -> AgilerlAgent:
     """Return the agent that a checkpoint describes."""
     actor = data["actor_init_dict"]
     critics = [data[k] for k in ("critic_state_dict", "critic_1_state_dict") if k in data]
@@ -137,7 +137,7 @@ def _agent(kind: Any, data: Mapping[str, Any]) -> Agent:
         for flat in (state.critic, state.critic_target):
             for name, view in algorithm.critics.layout.views(flat[:, i]).items():
                 view[0].copy_(named[name])
-    agent: Agent = kind.__new__(kind)
+    agent: AgilerlAgent = kind.__new__(kind)
     agent.take(Member(0, algorithm.config, state), spaces, Seeds(0))
     agent.scores, agent.fitness = (
         [float(x) for x in data.get(k, ())] for k in ("scores", "fitness")

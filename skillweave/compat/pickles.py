@@ -21,7 +21,7 @@ from torch import Tensor
 
 from skillweave._internal.messages import short, shortened
 from skillweave.errors import RunError, SkillweaveError
-from skillweave.policies.files import check_file, shown
+from skillweave.policies.untrusted import check_file, shown
 
 DEEPEST = 100
 """Deepest nesting of a pickle's objects: hashing a deeper tuple overflows Python's stack."""
@@ -75,7 +75,7 @@ class _Held:
         raise RunError("refused: the pickle sets the attributes of a tensor")
 
 
-class _Maker:
+class _Call:
     """A function that the pickle may only call."""
 
     __slots__ = ("_function",)
@@ -107,7 +107,7 @@ def read_torch_pickle(path: Path) -> Any:
             program = file.read(name)
             check_program(program)
             prefix = name.removesuffix("data.pkl")
-            return _plain(_Reader(io.BytesIO(program), file, prefix).load())
+            return _plain(_Unpickler(io.BytesIO(program), file, prefix).load())
     except zipfile.BadZipFile as error:
         reason = shortened(str(error))  # it may quote much of the file
         raise RunError(
@@ -201,7 +201,7 @@ def _plain(data: Any) -> Any:
     return data.item() if isinstance(data, np.generic) else data
 
 
-class _Reader(pickle.Unpickler):
+class _Unpickler(pickle.Unpickler):
     def __init__(self, data: Any, file: zipfile.ZipFile, prefix: str) -> None:
         super().__init__(data, encoding="utf-8")
         self._file = file
@@ -220,7 +220,7 @@ class _Reader(pickle.Unpickler):
                 f"refused: the pickle names {module[:60]}.{name[:60]}, which is neither a tensor, "
                 "a number, an array, a device nor a plain container"
             )
-        return self._inert if allowed is Inert else _Maker(allowed)
+        return self._inert if allowed is Inert else _Call(allowed)
 
     def persistent_load(self, pid: Any) -> _Held:
         kind, dtype, key, _, size = pid
@@ -273,7 +273,7 @@ class _Array(np.ndarray[Any, Any]):
 
 
 def _create_array(make: Any, arguments: Any, state: Any, *_: Any) -> Any:
-    if not isinstance(make, _Maker) or make._function is not _Array:  # dill writes arrays so
+    if not isinstance(make, _Call) or make._function is not _Array:  # dill writes arrays so
         raise RunError(f"refused: the pickle makes an array by {shown(make)}")
     array = _Array(*arguments)
     array.__setstate__(state)

@@ -9,6 +9,6 @@ from skillweave._internal.public import lazy
 
 if TYPE_CHECKING:
     from skillweave.envs.pool import PoolWrapper as PoolWrapper, one_of as one_of
-    from skillweave.hierarchy.options import OptionsEnv as OptionsEnv
+    from skillweave.hierarchy.options_env import OptionsEnv as OptionsEnv
 else:
     __all__, __getattr__, __dir__ = lazy(__name__)

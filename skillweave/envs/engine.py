@@ -24,9 +24,9 @@ import numpy as np
 from skillweave._internal.messages import short
 from skillweave._internal.notices import are_collected, notice
 from skillweave._internal.seeding import GlobalDraws, are_shared
-from skillweave.envs.checks import Watch, time_limit
+from skillweave.envs.checked import Watch, time_limit
+from skillweave.envs.env_infos import ActionMasks, time_limits
 from skillweave.envs.history import History
-from skillweave.envs.infos import ActionMasks, time_limits
 from skillweave.envs.repeats import check_first_steps, check_used
 from skillweave.errors import EnvError, SkillweaveError, reworded
 from skillweave.policies.infos import InfoKeys, batched_infos

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skillweave.envs.engine import Engine, RawStep
-from skillweave.envs.infos import joined_infos
+from skillweave.envs.env_infos import joined_infos
 from skillweave.policies.core import info_rows
 from skillweave.types import Array
 

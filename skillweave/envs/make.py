@@ -18,10 +18,10 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import error_text, short, shortened, suggest
 from skillweave._internal.notices import notice
 from skillweave._internal.seeding import Seeds, global_generators
-from skillweave.envs.checks import CheckedEnv, is_batched, refuse_batched
+from skillweave.envs.checked import CheckedEnv, is_batched, refuse_batched
 from skillweave.envs.engine import Engine, GymnasiumEngine
+from skillweave.envs.env_infos import ActionMasks, random_actions
 from skillweave.envs.envpool_engine import EnvPoolEngine
-from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.obs_names import Names, ObsNames, names_in
 from skillweave.envs.pool import MakePool, envpool, takes_ids
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError

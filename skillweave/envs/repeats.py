@@ -15,7 +15,7 @@ import numpy as np
 
 from skillweave._internal.notices import are_collected, notice
 from skillweave._internal.seeding import Seeds, global_generators
-from skillweave.envs.infos import allowed_rows, random_actions
+from skillweave.envs.env_infos import allowed_rows, random_actions
 from skillweave.errors import SkillweaveError
 from skillweave.types import Array
 

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from skillweave._internal.named import Named
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.parameters import ParameterGroup
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.errors import DeclarationError
 from skillweave.evolution.config import Mutations
 from skillweave.evolution.stacks import Member, copy, even_count, networks_of, spread_count

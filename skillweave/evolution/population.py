@@ -13,8 +13,8 @@ from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.evolution.config import Evolution
 from skillweave.evolution.mutation import mutate, random_config
-from skillweave.evolution.part import FitnessEnvs, OnGenerationTick, Part
 from skillweave.evolution.selection import select
+from skillweave.evolution.shard import FitnessEnvs, OnGenerationTick, Shard
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member, copy, grouped
 from skillweave.runs.manifest import Origin
@@ -38,13 +38,13 @@ class Population:
         evolution: Evolution,
         learning_task: LearningTask,
         seeds: Seeds,
-        part: Part | Parts | None = None,
+        part: Shard | Parts | None = None,
     ) -> None:
         self.members = members
         self.evolution = evolution
         self.spaces = learning_task.role.spaces
         self.next_number = len(members)
-        self.part = part or Part(learning_task, members[0].config, seeds, len(members))
+        self.part = part or Shard(learning_task, members[0].config, seeds, len(members))
 
     @classmethod
     def fresh(
@@ -53,7 +53,7 @@ class Population:
         evolution: Evolution,
         learning_task: LearningTask,
         seeds: Seeds,
-        part: Part | Parts | None = None,
+        part: Shard | Parts | None = None,
     ) -> Population:
         """Create the first generation, each member with its own weights."""
         members = []

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from skillweave._internal.seeding import Seeds, seed_global_generators
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
-from skillweave.algorithms.policy import make_algorithm
-from skillweave.evolution.part import FitnessEnvs, OnGenerationTick, Part
+from skillweave.evolution.shard import FitnessEnvs, OnGenerationTick, Shard
 from skillweave.evolution.stacks import Member
 from skillweave.experience.group import joined_states, split_states
 from skillweave.training.episodes import EpisodeTally
@@ -127,7 +127,7 @@ class Parts:
 class PartHost:
     """A part of a population at its worker; arguments and results are plain data."""
 
-    def __init__(self, part: Part, eval_envs: FitnessEnvs) -> None:
+    def __init__(self, part: Shard, eval_envs: FitnessEnvs) -> None:
         self._part = part
         self._eval_envs = eval_envs
 
@@ -170,7 +170,7 @@ def _make_host(
 ) -> PartHost:
     seed_global_generators(seeds / "global" / number)
     first, end = bounds[number], bounds[number + 1]
-    part = Part(learning_task, config, seeds, end - first, first)
+    part = Shard(learning_task, config, seeds, end - first, first)
     return PartHost(part, FitnessEnvs(learning_task, episodes, config.num_envs))
 
 

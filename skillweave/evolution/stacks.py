@@ -15,10 +15,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.parameters import ParameterGroup
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.schedules import is_schedule
 from skillweave.networks.config import Network
 from skillweave.networks.stacked import Layout

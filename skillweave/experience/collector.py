@@ -13,7 +13,7 @@ from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds, seed_global_generators
 from skillweave.algorithms.batches import Batch, Trace, padded_last_axis, side_by_side
 from skillweave.envs.engine import Engine, RawStep, checksums
-from skillweave.envs.infos import info_numbers, notice_odd_success, reported_success
+from skillweave.envs.env_infos import info_numbers, notice_odd_success, reported_success
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.acting import Acting, Request
 from skillweave.experience.learners import Alone, Calling, LevelLearners, OneLearner

@@ -14,15 +14,15 @@ import numpy as np
 
 from skillweave._internal.paths import CRITIC, SELECTOR
 from skillweave.algorithms.batches import INFO, OF_STEP, Batch, Trace
-from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.envs.checked import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
 from skillweave.experience.acting import Acting, Request
-from skillweave.experience.calls import OpenCalls
-from skillweave.experience.levels import Level, own_memory, with_learners
+from skillweave.experience.decisions import OpenCalls
+from skillweave.experience.levels import LearningLevel, own_memory, with_learners
 from skillweave.experience.search import Starts
 from skillweave.experience.views import OwnSteps, call_successes, info_numbers_of, rows_of
 from skillweave.experience.writer import TraceWriter
-from skillweave.policies.core import EPISODE, LIMIT, RUNNING, Policy, end_with_episode
+from skillweave.policies.core import EPISODE, LIMIT, RUNNING, RowPolicy, end_with_episode
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.policies.leaves import Learning
 from skillweave.skills import Reflex, Skill
@@ -89,7 +89,7 @@ class OneLearner:
     def __init__(self, who: Alone, engine: Engine, acting: Acting | None) -> None:
         self._acting, self._part, self._goals = acting, who.part, goals_of(who.skill)
         self._space = engine.action_space if who.part is None else who.part.action_space
-        leaf = Policy() if acting is None else Learning(acting, "")
+        leaf = RowPolicy() if acting is None else Learning(acting, "")
         space = engine.action_space
         self.policy = acting_apart(leaf, who.skill, who.part, who.reflexes, space)
         self.memory = self.policy.start(engine.num_envs)
@@ -163,7 +163,9 @@ class LevelLearners:
         self.policy = acting_policy(skills, selector, who.guide, goals, outermost=False)
         self.memory = self.policy.start(engine.num_envs)
         """The policy's, of all environments; changed in place."""
-        self.root = Level(skills, within(self.policy), self.memory, learners or {}, who.skill)
+        self.root = LearningLevel(
+            skills, within(self.policy), self.memory, learners or {}, who.skill
+        )
         self.levels = tuple(self.root.all())
         """The levels in which something learns."""
         self.whole = self._together or who.skill is not None
@@ -266,7 +268,7 @@ class LevelLearners:
         return Batch(**columns, **{INFO + key: info_numbers_of(trace, key) for key in info})
 
     def _of_level(
-        self, trace: Trace, level: Level, steps: Batch, end: Array, closes: Array
+        self, trace: Trace, level: LearningLevel, steps: Batch, end: Array, closes: Array
     ) -> Iterator[tuple[str, Batch]]:
         """Yield what the learners of a level did, by path, and of those below it.
 
@@ -291,7 +293,7 @@ class LevelLearners:
                 yield from self._of_level(trace, *self._inside(trace, level, i, acts, end))
 
     @staticmethod
-    def _of_critic(trace: Trace, level: Level, steps: Batch) -> Batch:
+    def _of_critic(trace: Trace, level: LearningLevel, steps: Batch) -> Batch:
         """Return all steps of a level, for its critic."""
         acts, running = steps["valid"], trace[level.path + "skill"]
         seen = {name: level.seen(trace, name) for name in ("obs", "next_obs")}
@@ -308,7 +310,9 @@ class LevelLearners:
             call_start=acts & (trace[level.path + "call_elapsed"] == 1),
         )
 
-    def _of_skill(self, trace: Trace, level: Level, i: int, acts: Array, end: Array) -> Batch:
+    def _of_skill(
+        self, trace: Trace, level: LearningLevel, i: int, acts: Array, end: Array
+    ) -> Batch:
         """Return what a skill that learns did, judged by its own reward and ends."""
         skill, part, goals = level.skills[i], level.skill_set.part(i), level.hierarchy.goals.get(i)
         path, own = level.path + skill.name, OwnSteps.called(trace, level.path, skill, acts)
@@ -325,8 +329,8 @@ class LevelLearners:
 
     @staticmethod
     def _inside(
-        trace: Trace, level: Level, i: int, acts: Array, end: Array
-    ) -> tuple[Level, Batch, Array, Array]:
+        trace: Trace, level: LearningLevel, i: int, acts: Array, end: Array
+    ) -> tuple[LearningLevel, Batch, Array, Array]:
         """Judge a skill that is a hierarchy; return the arguments of ``_of_level`` for it."""
         below, own = level.below[i], OwnSteps.called(trace, level.path, level.skills[i], acts)
         steps, over, ended = own.rows(end), trace.ended, trace[below.path + "call_end"]

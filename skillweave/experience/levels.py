@@ -14,7 +14,7 @@ from skillweave._internal.paths import CRITIC, SELECTOR
 from skillweave.algorithms.batches import Trace
 from skillweave.experience.acting import Acting
 from skillweave.policies.core import Memory
-from skillweave.policies.hierarchy import ActiveGuide, Hierarchy, Interruption
+from skillweave.policies.hierarchy import ActiveGuide, CallAndReturn, Interruption
 from skillweave.policies.leaves import Learning
 from skillweave.skills import Skill
 from skillweave.skills.goals import Goals, goals_of
@@ -89,11 +89,11 @@ def _worth(critic: Acting) -> Callable[[Array], Array]:
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
+class LearningLevel:
     """Skills below one selector: the root's, or those of a skill that is a hierarchy and learns."""
 
     skill_set: SkillSet
-    hierarchy: Hierarchy
+    hierarchy: CallAndReturn
     """Of these skills."""
     memory: Memory
     """What it remembers, of all environments; changed in place."""
@@ -126,14 +126,14 @@ class Level:
         return trace[name] if own is None else own.join(trace[name], trace[self.path + "goal"])
 
     @cached_property
-    def below(self) -> dict[int, Level]:
+    def below(self) -> dict[int, LearningLevel]:
         """The skills that are hierarchies in which something learns, by their place in the list."""
-        found: dict[int, Level] = {}
+        found: dict[int, LearningLevel] = {}
         for i, (skill, policy) in enumerate(zip(self.skills, self.skill_set.policies, strict=True)):
             path = f"{self.path}{skill.name}/"
             if any(name.startswith(path) for name in self.learners):
                 inside, memory = within(self.hierarchy.skills[i].policy), self.memory[str(i)]
-                found[i] = Level(policy.skills, inside, memory, self.learners, skill, path)
+                found[i] = LearningLevel(policy.skills, inside, memory, self.learners, skill, path)
         return found
 
     @cached_property
@@ -142,7 +142,7 @@ class Level:
         policies = enumerate(self.skill_set.policies)
         return {i: policy for i, policy in policies if isinstance(policy, Learning)}
 
-    def all(self) -> Iterator[Level]:
+    def all(self) -> Iterator[LearningLevel]:
         """Return this level and all below it, each before those below it."""
         yield self
         for level in self.below.values():

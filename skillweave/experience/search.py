@@ -13,7 +13,7 @@ import numpy as np
 
 from skillweave._internal.prefixes import prefixed
 from skillweave.envs.engine import Engine
-from skillweave.envs.infos import allowed_rows, random_actions
+from skillweave.envs.env_infos import allowed_rows, random_actions
 from skillweave.errors import TrainingError
 from skillweave.policies.core import RUNNING, Turn, World, flat, observed, part_of, restart
 from skillweave.skills import Skill, asked

@@ -8,32 +8,32 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.errors import PolicyError
 from skillweave.export.foreign import as_file
 from skillweave.export.graphs import agent_graph, worth_graph
 from skillweave.policies.actor import Deployed
-from skillweave.policies.core import Around, Policy
+from skillweave.policies.core import Around, RowPolicy
 from skillweave.policies.functional import Returns
 from skillweave.policies.hierarchy import (
     ActiveGuide,
+    CallAndReturn,
     CalledSkill,
     CallGoals,
     Critic,
-    Hierarchy,
     Interruption,
 )
-from skillweave.policies.leaves import Network, Selector
+from skillweave.policies.leaves import OnnxNetwork, Selector
 from skillweave.policies.mapped import Function, Mapped, Outputs
 from skillweave.policies.parts import Corrects, PartOf, Viewed
 from skillweave.policies.planned import Planned
 from skillweave.policies.spaces import Space, space_of
 from skillweave.skills.goals import Goals
 from skillweave.skills.skill_set import in_place
-from skillweave.types import Policy as AnyPolicy
+from skillweave.types import Policy
 
 
-def deployed(policy: AnyPolicy) -> Deployed:
+def deployed(policy: Policy) -> Deployed:
     """Return a policy of plain data, which acts the same.
 
     Raises:
@@ -45,7 +45,7 @@ def deployed(policy: AnyPolicy) -> Deployed:
     return Deployed(_compiled(in_place(policy), "", sampled=False), sees, acts)
 
 
-def _compiled(policy: Policy, name: str, *, sampled: bool) -> Policy:
+def _compiled(policy: RowPolicy, name: str, *, sampled: bool) -> RowPolicy:
     """Return a policy of plain data.
 
     Args:
@@ -54,7 +54,7 @@ def _compiled(policy: Policy, name: str, *, sampled: bool) -> Policy:
     """
     where = f"the policy of {name!r}" if name else "the policy"
     match policy:
-        case Hierarchy():
+        case CallAndReturn():
             return _hierarchy(policy, f"{name}/" if name else "", sampled)
         case Viewed() | PartOf() if isinstance(policy, Viewed) or policy.part.view is not None:
             raise PolicyError(
@@ -78,7 +78,7 @@ def _compiled(policy: Policy, name: str, *, sampled: bool) -> Policy:
     return policy
 
 
-def _leaf(policy: Returns, where: str, sampled: bool) -> Policy:
+def _leaf(policy: Returns, where: str, sampled: bool) -> RowPolicy:
     """Return what is no combinator: a network, or a function."""
     inside = policy.policy
     if isinstance(inside, AgentPolicy):
@@ -93,11 +93,11 @@ def _leaf(policy: Returns, where: str, sampled: bool) -> Policy:
     return Mapped(Function(partial(_actions, inside)), Outputs(space, logits=False))
 
 
-def _actions(policy: AnyPolicy, obs: Any) -> Any:
+def _actions(policy: Policy, obs: Any) -> Any:
     return policy.act({}, obs)[0]
 
 
-def _hierarchy(policy: Hierarchy, prefix: str, sampled: bool) -> Hierarchy:
+def _hierarchy(policy: CallAndReturn, prefix: str, sampled: bool) -> CallAndReturn:
     guide = policy.guide
     if guide is not None:
         of = _compiled(guide.selector, f"{prefix}guide", sampled=False)
@@ -106,7 +106,7 @@ def _hierarchy(policy: Hierarchy, prefix: str, sampled: bool) -> Hierarchy:
     assert policy.selector is not None
     ready = (policy.selector, None if guide is None else guide.selector)
     knows = any(isinstance(x, Selector) and x.ends_matter for x in ready)
-    return Hierarchy(
+    return CallAndReturn(
         _compiled(policy.selector, f"{prefix}selector", sampled=samples),
         tuple(_skill(one, prefix, knows, sampled=not policy.greedy) for one in policy.skills),
         policy.lengths,
@@ -138,4 +138,4 @@ def _interruption(how: Interruption | None, prefix: str) -> Interruption | None:
     file = worth_graph(how.critic, "the skill critic")
     values = int(how.critic.heads(sees.start(1)).shape[1])
     worth = Space("Box", "float32", (values,), np.array(-np.inf), np.array(np.inf))
-    return Interruption(Critic(Network(file, sees, worth)), how.margin)
+    return Interruption(Critic(OnnxNetwork(file, sees, worth)), how.margin)

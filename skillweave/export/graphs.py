@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.errors import PolicyError, needs_extra
 from skillweave.networks.heads import ActionHead, JointHead
 from skillweave.ops.device import BOOL, FLOAT
-from skillweave.policies.leaves import Network
+from skillweave.policies.leaves import OnnxNetwork
 from skillweave.policies.spaces import space_of
 from skillweave.spaces import ActionCodec, ChoiceSpace, JointCodec
 from skillweave.spaces.choices import NumberedChoiceCodec
@@ -49,7 +49,7 @@ def mask_width(space: gym.Space[Any]) -> int:
 class _Acting(nn.Module):
     """A trained agent on one observation; inputs: leaves, mask, memory, noise."""
 
-    def __init__(self, policy: AgentPolicy, inputs: Network) -> None:
+    def __init__(self, policy: AgentPolicy, inputs: OnnxNetwork) -> None:
         super().__init__()
         self.policy = policy
         self.inputs = inputs
@@ -88,7 +88,7 @@ class _Worth(nn.Module):
         return values[0]
 
 
-def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Network:
+def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> OnnxNetwork:
     """Return a trained agent as the graph of its network.
 
     Inputs ``obs…``, ``mask``, ``memory``, ``noise.…``; outputs ``action``, ``memory.after``.
@@ -104,7 +104,7 @@ def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Network:
     sees, acts = space_of(policy.observation_space), space_of(policy.action_space)
     choices = mask_width(policy.action_space)
     noise = _noise_of(algorithm) if sampled else ()
-    graph = Network(b"", sees, acts, choices, algorithm.memory_size, noise)
+    graph = OnnxNetwork(b"", sees, acts, choices, algorithm.memory_size, noise)
     if choices:
         given["mask"] = torch.ones(1, choices, **BOOL)
     outputs = ["action"]

@@ -16,12 +16,12 @@ from skillweave.errors import DeclarationError, PolicyError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.policies.actor import Deployed
 from skillweave.policies.codec import read_folder
-from skillweave.policies.core import Around, Policy, innermost
-from skillweave.policies.files import checksum
+from skillweave.policies.core import Around, RowPolicy, innermost
 from skillweave.policies.functional import Functional
-from skillweave.policies.hierarchy import CalledSkill, Hierarchy
+from skillweave.policies.hierarchy import CallAndReturn, CalledSkill
 from skillweave.policies.mapped import Mapped, Take
 from skillweave.policies.parts import Reflexes
+from skillweave.policies.untrusted import checksum
 from skillweave.schema import fitted
 from skillweave.skills import Reflex
 from skillweave.skills.base import RecordedSkill
@@ -33,12 +33,12 @@ from skillweave.skills.mapped import check_range
 from skillweave.skills.mapping import GoalValue, check_in_range
 from skillweave.skills.skill_set import SkillSet, within
 from skillweave.spaces.saving import gym_space
-from skillweave.types import Policy as AnyPolicy
+from skillweave.types import Policy
 
 
 def read_policy(
     folder: Path, code: Mapping[str, Callable[..., Any]] | None = None, goal: Any = None
-) -> AnyPolicy:
+) -> Policy:
     """Return the policy in a folder.
 
     Args:
@@ -52,7 +52,7 @@ def read_policy(
         DeclarationError: it takes no goal.
     """
     deployed, _, archive = read_folder(folder, code)
-    if isinstance(innermost(deployed.policy), Hierarchy):
+    if isinstance(innermost(deployed.policy), CallAndReturn):
         if goal is not None:
             raise DeclarationError(f"load_policy(): the policy in {folder} takes no goal")
         return ExportedHierarchy(deployed, checksum(archive))
@@ -165,9 +165,9 @@ def _skill_set(deployed: Deployed) -> SkillSet:
     )
 
 
-def _policy(skill: CalledSkill, deployed: Deployed) -> AnyPolicy:
+def _policy(skill: CalledSkill, deployed: Deployed) -> Policy:
     inside = Deployed(skill.policy, deployed.sees, deployed.acts)
-    if isinstance(innermost(skill.policy), Hierarchy):
+    if isinstance(innermost(skill.policy), CallAndReturn):
         return ExportedHierarchy(inside, "")
     spaces = gym_space(deployed.sees), gym_space(deployed.acts)
     return Functional(skill.policy, *spaces, joins=skill.goals is not None)
@@ -189,7 +189,7 @@ def _recorded(called: CalledSkill) -> RecordedSkill:
     return skill
 
 
-def _reflexes(policy: Policy) -> tuple[Reflex, ...]:
+def _reflexes(policy: RowPolicy) -> tuple[Reflex, ...]:
     """Return the reflexes around a hierarchy."""
     found: list[Reflex] = []
     while isinstance(policy, Around):

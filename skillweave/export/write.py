@@ -13,7 +13,7 @@ from skillweave import policies
 from skillweave._internal.terminal import printable
 from skillweave.export.compile import deployed
 from skillweave.policies.codec import FORMAT, MANIFEST, Written
-from skillweave.policies.files import checksum
+from skillweave.policies.untrusted import checksum
 from skillweave.runs.files import write_bytes
 from skillweave.types import Policy
 

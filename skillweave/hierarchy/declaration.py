@@ -28,8 +28,8 @@ from skillweave.planning.predicates import named_predicates
 from skillweave.schema import Positive, check_fields, fitted
 from skillweave.skills import Skill, is_trained
 from skillweave.spaces import action_codec, obs_codec
-from skillweave.training.checks import check_env
 from skillweave.training.defaults import TrainDefaults
+from skillweave.training.env_check import check_env
 from skillweave.training.plain_agent import Declared, PlainAgent
 from skillweave.training.stage import TOGETHER, Stage
 

@@ -24,7 +24,7 @@ from skillweave.skills.learnable import Learnable
 from skillweave.skills.ready import PART, fitted_to_skill
 from skillweave.skills.skill_set import skills_below
 from skillweave.spaces import obs_codec
-from skillweave.training.checks import check_rollout
+from skillweave.training.env_check import check_rollout
 from skillweave.training.role import Role
 from skillweave.types import Policy
 

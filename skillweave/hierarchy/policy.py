@@ -12,10 +12,10 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError
 from skillweave.policies.core import Memory as InPlaceMemory, flat, split
-from skillweave.policies.files import checksum
 from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import ActiveGuide, Interruption
 from skillweave.policies.parts import OWN_GOAL
+from skillweave.policies.untrusted import checksum
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import without_goal
 from skillweave.skills.goals import Goals, goals_of

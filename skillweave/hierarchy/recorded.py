@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from skillweave.errors import RunError
 from skillweave.hierarchy.roles import Level, Roles
-from skillweave.policies.files import shown
+from skillweave.policies.untrusted import shown
 from skillweave.runs.manifest import GuideEntry, LevelEntry, SkillEntry
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goals import goals_of

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from skillweave._internal.messages import short
 from skillweave._internal.paths import AGENT, below, join, level_of
-from skillweave.algorithms.policy import AgentHeader, AgentPolicy
+from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
 from skillweave.hierarchy.assembly import assembled, own_parts_of, parts_of
@@ -29,7 +29,7 @@ from skillweave.hierarchy.recorded import (
     with_entry,
 )
 from skillweave.hierarchy.roles import Level, Roles
-from skillweave.policies.files import shown
+from skillweave.policies.untrusted import shown
 from skillweave.runs.files import LARGEST_WEIGHTS, read_tensors, record_in, write_tensors
 from skillweave.runs.manifest import GuideEntry, Recorded
 from skillweave.runs.user_code import environment_texts, notice_changes

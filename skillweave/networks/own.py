@@ -207,7 +207,7 @@ def _constants(module: nn.Module) -> dict[str, Tensor]:
 
 
 @dataclass(frozen=True)
-class _Part:
+class _Input:
     """An innermost part of an observation, as ``forward`` receives it."""
 
     source: str  # of the network's inputs
@@ -236,22 +236,22 @@ class _Part:
         return torch.from_numpy(values.astype(np.float32))
 
 
-def _parts_of(obs: ObsCodec) -> list[_Part]:
+def _parts_of(obs: ObsCodec) -> list[_Input]:
     """Return the parts of an observation in the order of ``ObsCodec.leaves``."""
-    observed: list[_Part] = []
+    observed: list[_Input] = []
     start = 0
     images = 0
     for leaf in obs.leaves:
         if leaf.image is not None:
             low, high = (obs.pixels(x, images) for x in leaf.ends)
             box = gym.spaces.Box(low.numpy(), high.numpy(), dtype=np.float32)
-            observed.append(_Part(f"image.{images}", box))
+            observed.append(_Input(f"image.{images}", box))
             images += 1
             continue
         shape = (leaf.size,) if leaf.choices else leaf.shape
         bounds = (0.0, 1.0) if leaf.choices else (-np.inf, np.inf)
         box = gym.spaces.Box(*bounds, shape, np.float32)
-        observed.append(_Part("vector", box, start, leaf.choices))
+        observed.append(_Input("vector", box, start, leaf.choices))
         start += leaf.size
     return observed
 

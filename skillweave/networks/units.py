@@ -14,7 +14,7 @@ from skillweave.networks.qnet import QNet
 
 
 @dataclass(frozen=True)
-class Part:
+class UnitRange:
     """The position of a layer's units in a parameter: unit u at ``start + u·block`` of an axis."""
 
     name: str
@@ -28,8 +28,8 @@ class Units:
     """Units of one layer: the parameters that compute them, and those that read them."""
 
     count: int
-    own: tuple[Part, ...]
-    onward: tuple[Part, ...]
+    own: tuple[UnitRange, ...]
+    onward: tuple[UnitRange, ...]
 
 
 def units_of(
@@ -39,8 +39,8 @@ def units_of(
     names = (f"{name}{sigma}" for name in readers for sigma in ("", "_sigma"))
     return Units(
         count,
-        tuple(Part(name, -1) for name in shapes if name.startswith(f"{layer}.")),
-        tuple(Part(name, -2) for name in names if name in shapes),
+        tuple(UnitRange(name, -1) for name in shapes if name.startswith(f"{layer}.")),
+        tuple(UnitRange(name, -2) for name in names if name in shapes),
     )
 
 
@@ -121,14 +121,14 @@ def _encoder_units(
     count = cnn.channels[layer]
     last = layer == len(cnn.channels) - 1
 
-    def own(*names: str) -> tuple[Part, ...]:
-        filters = tuple(Part(f"{prefix}.{n}.weight", -4) for n in names)
-        return (*filters, *(Part(f"{prefix}.{n}.bias", -1) for n in names))
+    def own(*names: str) -> tuple[UnitRange, ...]:
+        filters = tuple(UnitRange(f"{prefix}.{n}.weight", -4) for n in names)
+        return (*filters, *(UnitRange(f"{prefix}.{n}.bias", -1) for n in names))
 
-    def read(*names: str) -> tuple[Part, ...]:
-        return tuple(Part(f"{prefix}.{n}.weight", -3) for n in names)
+    def read(*names: str) -> tuple[UnitRange, ...]:
+        return tuple(UnitRange(f"{prefix}.{n}.weight", -3) for n in names)
 
-    after = tuple(Part(name, -2, start, encoder.size // count) for name, start in onward)
+    after = tuple(UnitRange(name, -2, start, encoder.size // count) for name, start in onward)
     if cnn.kind == "plain":
         return [Units(count, own(str(layer)), after if last else read(str(layer + 1)))]
     stage = layer

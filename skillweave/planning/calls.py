@@ -16,7 +16,7 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.planning.call_file import read_calls, write_calls
 from skillweave.planning.columns import columns_of, fields_of
 from skillweave.planning.handover import LinkedCalls
-from skillweave.policies.files import checksum
+from skillweave.policies.untrusted import checksum
 from skillweave.runs.user_code import (
     Texts,
     changes,

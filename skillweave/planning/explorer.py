@@ -11,7 +11,7 @@ from skillweave.planning.calls import CallLog
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbors import check_features
-from skillweave.policies.core import Memory, Policy, Turn
+from skillweave.policies.core import Memory, RowPolicy, Turn
 from skillweave.schema import AtLeastOne, Check, Fraction, Positive, fitted
 from skillweave.types import Array
 
@@ -21,7 +21,7 @@ _Temperature = Annotated[float, Check("from 1e-06 to 10", lambda x: 1e-6 <= x <=
 
 
 @checked_names
-class Explorer(Policy):
+class Explorer(RowPolicy):
     """A selector for ``record_calls`` that prefers calls which differ from the logged ones.
 
     Where the nearest logged call of a skill is further than ``radius``, calling it is worth the

@@ -23,10 +23,10 @@ from skillweave.planning.lacking import asks_nothing, obstacle
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission import as_task
 from skillweave.planning.neighbors import check_features
-from skillweave.policies.files import checksum
 from skillweave.policies.plan import Near
 from skillweave.policies.planned import Planned
 from skillweave.policies.spaces import space_of
+from skillweave.policies.untrusted import checksum
 from skillweave.schema import AtLeastOne, Check, Fraction, fitted
 from skillweave.skills.goal_spaces import MOST_SHOWN, shown_goal
 from skillweave.skills.selector import ReadySelector

@@ -15,7 +15,7 @@ from skillweave._internal.interrupts import deferred, requested
 from skillweave._internal.messages import short
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.envs.engine import Engine, GymnasiumEngine, episode_seed
-from skillweave.envs.infos import allowed_rows
+from skillweave.envs.env_infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError, Interrupted
 from skillweave.planning.calls import CallLog
@@ -25,7 +25,7 @@ from skillweave.policies.core import (
     Around,
     CallEnd,
     Memory as InPlaceMemory,
-    Policy as InPlace,
+    RowPolicy,
     Turn,
     World,
     restart,
@@ -39,7 +39,7 @@ from skillweave.spaces import same_space
 from skillweave.types import Array
 
 
-class RandomChoice(InPlace):
+class RandomChoice(RowPolicy):
     """A selector that chooses uniformly among what may start.
 
     Args:
@@ -195,7 +195,7 @@ def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
     names, choices = tuple(s.name for s in skills.skills), skills.choice_space
     if isinstance(choose, Explorer):
         choose.begin(skills.choices)
-    if isinstance(choose, InPlace):
+    if isinstance(choose, RowPolicy):
         return WithDrawnGoals(choose, skills, choices) if goals_in(skills) else choose
     if isinstance(choose, ReadySelector) or not hasattr(choose, "act"):
         if (ready := ready_selector(choose, names)) is not None:
@@ -219,7 +219,7 @@ def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
 def _play(
     recorder: Recorder,
     engine: Engine,
-    policy: InPlace,
+    policy: RowPolicy,
     steps: int,
     turn: Turn,
     seed: int,

@@ -55,7 +55,7 @@ FED_BYTES = 2**25
 
 
 @dataclass
-class _Part:
+class _Piece:
     """Calls that ended and steps that were made in one trace."""
 
     first: int
@@ -135,7 +135,7 @@ class Recorder:
         # began, its first calls are unknown, so the next one is number 1 in it.
         self._first = np.full(n, -1)
         self._episodes = self._calls = 0
-        self._parts: deque[_Part] = deque()
+        self._parts: deque[_Piece] = deque()
         self._last: tuple[Trace, Array] | None = None  # the last row of the trace before
         if latest is not None:
             check_size(latest, spaces)
@@ -192,7 +192,7 @@ class Recorder:
         if self._own_rewards:
             self._judge(trace, mine, over, calls, at, ids)
         self._end(trace, over, calls, at[over])
-        part = _Part(self._calls, np.concatenate([ended, calls[at[over]]]), steps)
+        part = _Piece(self._calls, np.concatenate([ended, calls[at[over]]]), steps)
         self._latest[ids], self._open[ids] = calls[at[-1]], mine[-1] & ~over[-1]
         self._calls += len(calls) - k
         infos = trace.infos[-1:] if isinstance(trace, Trace) else ()
@@ -343,7 +343,7 @@ class Recorder:
             may = self.skills.hierarchy.may_start(trace["next_obs"][over])
             calls["may_follow"][at] = may
 
-    def _keep(self, part: _Part) -> None:
+    def _keep(self, part: _Piece) -> None:
         """Keep a new part, and forget the oldest ones that are not needed."""
         self._parts.append(part)
         self.steps += part.size

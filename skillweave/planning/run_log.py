@@ -19,7 +19,7 @@ from skillweave.planning.calls import CallLog, join
 from skillweave.planning.columns import columns_of
 from skillweave.planning.handover import Handover
 from skillweave.planning.recorder import MOST_BYTES
-from skillweave.policies.files import check_file
+from skillweave.policies.untrusted import check_file
 from skillweave.runs.directory import CALLS, CALLS_LOCK, RunDirectory
 from skillweave.runs.files import read_header
 from skillweave.runs.lock import Lock

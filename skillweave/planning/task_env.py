@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.envs.checks import last_observation
+from skillweave.envs.checked import last_observation
 from skillweave.errors import EnvError
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.mission import Task

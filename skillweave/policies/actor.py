@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .core import Array, Memory, Policy, Step, Turn, World
-from .errors import DeclarationError, PolicyError
+from .acting_errors import DeclarationError, PolicyError
+from .core import Array, Memory, RowPolicy, Step, Turn, World
 from .floats import usual_floats
 from .infos import batched_infos
 from .spaces import Space, allows_each, at
@@ -24,7 +24,7 @@ MASK = "action_mask"
 class Deployed:
     """A policy with the spaces of its environment."""
 
-    policy: Policy
+    policy: RowPolicy
     sees: Space
     acts: Space
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from .acting_errors import PolicyError
 from .core import Array
-from .errors import PolicyError
-from .files import shown
+from .untrusted import shown
 
 DIRECTORY = 2**24
 """The most bytes of an archive's list of files."""

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from .actor import Deployed
-from .hierarchy import Hierarchy
-from .leaves import Network
+from .hierarchy import CallAndReturn
+from .leaves import OnnxNetwork
 from .mapped import LONGEST, Mapped, OnnxFile, Take
 from .plan import Options
 from .planned import LATEST, Planned
-from .selectors import Automaton
+from .selectors import StateMachine
 from .spaces import MOST, Space
 
 BUDGET = 2**31
@@ -106,12 +106,12 @@ def _planned(values: Values) -> int:
 COSTS: dict[type[Any], Callable[[Values], int]] = {
     Space: _space,
     Deployed: _deployed,
-    Network: _network,
+    OnnxNetwork: _network,
     OnnxFile: lambda values: _session(values["content"]),
     Mapped: _mapped,
     Take: _take,
-    Hierarchy: _hierarchy,
-    Automaton: _automaton,
+    CallAndReturn: _hierarchy,
+    StateMachine: _automaton,
     Options: _options,
     Planned: _planned,
 }

@@ -20,12 +20,12 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from . import actor, hierarchy, leaves, mapped, parts, plan, planned, selectors, spaces
+from .acting_errors import PolicyError, RunError
 from .actor import Deployed
 from .archives import numbers_in, unzipped
 from .budget import BUDGET, cost
 from .core import Array
-from .errors import PolicyError, RunError
-from .files import checksum, parse_json, read_file, shown, shown_text
+from .untrusted import checksum, parse_json, read_file, shown, shown_text
 
 FORMAT = 3
 """Version of ``policy.json``."""

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import SkillError
+from .acting_errors import SkillError
 from .infos import with_missing
 
 Array: TypeAlias = NDArray[Any]
@@ -239,7 +239,7 @@ class Choices:
         return choice // self.each
 
 
-class Policy:
+class RowPolicy:
     """Acts in some of N environments; the base of all that do, for those that remember nothing."""
 
     watches = False
@@ -297,10 +297,10 @@ class Policy:
 
 
 @dataclass(eq=False)
-class Around(Policy):
+class Around(RowPolicy):
     """A policy that changes what another one sees or does; the base of combinators."""
 
-    policy: Policy
+    policy: RowPolicy
 
     def __post_init__(self) -> None:
         policy = self.policy
@@ -310,7 +310,7 @@ class Around(Policy):
         self.holds = policy.holds
 
 
-def innermost(policy: Policy) -> Policy:
+def innermost(policy: RowPolicy) -> RowPolicy:
     """Return the policy that combinators stand around."""
     while isinstance(policy, Around):
         policy = policy.policy
@@ -324,7 +324,7 @@ def _forward(name: str) -> Callable[..., Any]:
     return call
 
 
-for _name, _method in vars(Policy).items():  # a combinator can forget none of them
+for _name, _method in vars(RowPolicy).items():  # a combinator can forget none of them
     if callable(_method):
         setattr(Around, _name, _forward(_name))
 
@@ -384,7 +384,7 @@ def take(memory: Memory, rows: Array) -> Memory:
     return {k: take(v, rows) if isinstance(v, dict) else v[rows] for k, v in memory.items()}
 
 
-def restart(policy: Policy, memory: Memory, rows: Array) -> None:
+def restart(policy: RowPolicy, memory: Memory, rows: Array) -> None:
     """Start new episodes in environments ``rows`` (k,): nothing of earlier ones is remembered."""
     put(memory, rows, policy.start(len(rows)))
 

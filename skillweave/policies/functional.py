@@ -8,8 +8,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from .core import Array, Memory, Policy, Step, Turn, World, flat, nested
-from .errors import PolicyError
+from .acting_errors import PolicyError
+from .core import Array, Memory, RowPolicy, Step, Turn, World, flat, nested
 from .parts import GOAL, OBSERVATION
 
 
@@ -26,7 +26,7 @@ class Functional:
     labels: tuple[str, ...] = ()
     joins = False
 
-    def __init__(self, in_place: Policy, sees: Any, acts: Any, *, joins: bool = False) -> None:
+    def __init__(self, in_place: RowPolicy, sees: Any, acts: Any, *, joins: bool = False) -> None:
         self.in_place = in_place
         self.observation_space = sees
         self.action_space = acts
@@ -91,7 +91,7 @@ class Functional:
         return own == (Functional.start, Functional.act, Functional.observe)
 
 
-class Returns(Policy):
+class Returns(RowPolicy):
     """A policy of ``skillweave.types.Policy``: it is given its own rows, and returns its memory.
 
     Args:

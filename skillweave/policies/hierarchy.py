@@ -1,6 +1,6 @@
 """The life of a call, in one place: which skill acts in each environment, and until when.
 
-A ``Hierarchy`` remembers, for each environment:
+A ``CallAndReturn`` remembers, for each environment:
 
 - ``skill``: the running one, −1 where no call has started in the episode;
 - ``elapsed``: steps of its call; ``length``: the one that was chosen, where one is;
@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from .acting_errors import PolicyError, SkillError
 from .core import (
     EPISODE,
     INTERRUPTED,
@@ -32,7 +33,7 @@ from .core import (
     Choices,
     LastCall,
     Memory,
-    Policy,
+    RowPolicy,
     Step,
     Turn,
     World,
@@ -45,7 +46,6 @@ from .core import (
     put,
     take,
 )
-from .errors import PolicyError, SkillError
 from .leaves import Selector
 from .parts import GOAL, OBSERVATION, joined, joint_dtype, with_goal
 from .spaces import Space, discrete
@@ -126,7 +126,7 @@ class CalledSkill:
     name: str
     path: str
     """Its name in messages."""
-    policy: Policy
+    policy: RowPolicy
     limit: int | None = None
     """Steps after which a call is cut; None: never."""
     max_steps: int | None = None
@@ -152,7 +152,7 @@ class CalledSkill:
 class Critic:
     """A policy whose actions are the values of skills."""
 
-    policy: Policy
+    policy: RowPolicy
 
     def __call__(self, obs: Array) -> Array:
         """Return the values (n, S + 1) of observations (n, …)."""
@@ -190,7 +190,7 @@ NEVER = np.iinfo(np.int64).max
 
 
 @dataclass(eq=False)
-class Hierarchy(Choices, Policy):
+class CallAndReturn(Choices, RowPolicy):
     """Skills in calls, and the selector that starts them where a call has ended.
 
     A choice is a number: of a skill, or of a skill and one of the ``lengths``; where skills have
@@ -214,7 +214,7 @@ class Hierarchy(Choices, Policy):
 
     watches = True
 
-    selector: Policy | None
+    selector: RowPolicy | None
     skills: tuple[CalledSkill, ...]
     lengths: tuple[int, ...] = ()
     guide: ActiveGuide | None = None

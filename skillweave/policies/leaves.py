@@ -9,15 +9,15 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from .core import Array, LastCall, Memory, Policy, Step, Turn, World
-from .errors import PolicyError
-from .files import shown
+from .acting_errors import PolicyError
+from .core import Array, LastCall, Memory, RowPolicy, Step, Turn, World
 from .mapped import NUMBERS
 from .sessions import open_session
 from .spaces import Space, at
+from .untrusted import shown
 
 
-class Selector(Policy):
+class Selector(RowPolicy):
     """A selector that is not trained: it also watches how calls end."""
 
     watches = True
@@ -69,7 +69,7 @@ class Selector(Policy):
         return False
 
 
-class Learning(Policy):
+class Learning(RowPolicy):
     """A network that learns; what it chooses is written where the step is recorded.
 
     Args:
@@ -121,7 +121,7 @@ Noise: TypeAlias = tuple[Literal["gumbel", "standard_normal", "random", "logisti
 
 
 @dataclass(eq=False)
-class Network(Policy):
+class OnnxNetwork(RowPolicy):
     """A network that Skillweave trained, as an ONNX file of one observation.
 
     Its inputs are the leaves of the observation, ``obs`` or ``obs.camera``, and ``mask``,

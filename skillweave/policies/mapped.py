@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .core import Array, Memory, Policy, Turn, World, code, read_only
-from .errors import PolicyError
+from .acting_errors import PolicyError
+from .core import Array, Memory, RowPolicy, Turn, World, code, read_only
 from .sessions import open_session
 from .spaces import Space, at, discrete
 
@@ -161,7 +161,7 @@ def numbers_of(
 
 
 @dataclass(eq=False)
-class Linear:
+class Affine:
     """A scaling of a whole input, ``(x - offset) * scale``, then clipped; None: not at all."""
 
     offset: Array | None = None
@@ -189,7 +189,7 @@ class Input:
     takes: tuple[Take, ...]
     shape: tuple[int, ...]
     """Of one environment."""
-    scalings: tuple[Linear, ...] = ()
+    scalings: tuple[Affine, ...] = ()
     """In their order."""
     reshaped: bool = False
     """It is brought to its shape: one number with or without an axis of its own."""
@@ -682,7 +682,7 @@ class OnnxFile(Model):
 
 
 @dataclass(eq=False)
-class Mapped(Policy):
+class Mapped(RowPolicy):
     """A model behind a mapping.
 
     Its memory has, where the mapping needs them: ``state.0`` and following, the recurrent state;

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from .core import Around, Array, Memory, Policy, Step, Turn, World, asked, code, observed
-from .errors import PolicyError, SkillError
+from .acting_errors import PolicyError, SkillError
+from .core import Around, Array, Memory, RowPolicy, Step, Turn, World, asked, code, observed
 from .mapped import Input, check_places
 from .spaces import Space, allows_each, at
 
@@ -86,7 +86,7 @@ class Correction:
 class Corrects(Around):
     """A policy whose actions are added to those of another one, which is ready."""
 
-    base: Policy
+    base: RowPolicy
     correction: Correction
 
     def __post_init__(self) -> None:
@@ -127,7 +127,7 @@ class Corrects(Around):
 
 
 @dataclass(eq=False)
-class Part:
+class Slice:
     """The part of observations that a skill sees, and of actions that it writes.
 
     Raises:
@@ -340,7 +340,7 @@ class Part:
 class PartOf(Around):
     """A policy that sees and writes a part."""
 
-    part: Part
+    part: Slice
 
     def __post_init__(self) -> None:
         super().__post_init__()

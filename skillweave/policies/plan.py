@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from .acting_errors import PolicyError
 from .core import Array, Step, code
-from .errors import PolicyError
 from .mapped import fits_shape
 
 BLOCK = 4_000_000

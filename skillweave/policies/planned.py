@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from .acting_errors import PolicyError
 from .core import LIMIT, Array, LastCall, Memory, Step, Turn, own_step
-from .errors import PolicyError
 from .plan import SOFT, Features, Levels, Machine, Near, Options, Readings, check, nearest_corner
 from .selectors import Rule
 from .spaces import Space

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from .acting_errors import PolicyError, SkillError, SkillweaveError
 from .core import (
     EPISODE,
     RUNNING,
@@ -25,12 +26,11 @@ from .core import (
     read_only,
     take,
 )
-from .errors import PolicyError, SkillError, SkillweaveError
-from .files import shown
 from .hierarchy import SKILL
 from .leaves import Selector
 from .parts import GOAL
 from .spaces import Space, discrete
+from .untrusted import shown
 
 
 @dataclass(eq=False)
@@ -299,7 +299,7 @@ ENDS = ("success", "failure")
 
 
 @dataclass(eq=False)
-class Automaton(Rule):
+class StateMachine(Rule):
     """States with skills, and transitions by events in steps.
 
     After every step the first transition of a state whose event has happened is taken. Where a call
@@ -436,7 +436,7 @@ class Leaf:
 
 
 @dataclass(frozen=True, eq=False)
-class Check:
+class TreeCondition:
     """A condition in a tree: SUCCESS where it holds, else FAILURE."""
 
     name: str
@@ -450,12 +450,12 @@ class Branch:
 
     kind: Literal["Sequence", "Fallback"]
     """A Sequence continues while they succeed, a Fallback while they fail."""
-    children: tuple[Leaf | Check | Branch, ...]
+    children: tuple[Leaf | TreeCondition | Branch, ...]
     memory: bool = True
     """Continue with the running child; else begin with the first one at each evaluation."""
 
 
-Node = Leaf | Check | Branch
+Node = Leaf | TreeCondition | Branch
 GOES_ON = {"Sequence": Status.SUCCESS, "Fallback": Status.FAILURE}
 """By kind of a branch, the status of a child after which the next one is evaluated."""
 
@@ -468,15 +468,15 @@ class Tree(Rule):
     and ``child`` (n, C) (the running child of each branch).
     """
 
-    root: Leaf | Check | Branch
+    root: Leaf | TreeCondition | Branch
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.places: dict[Node, int] = {}
         """The number of each node among those of its kind."""
-        self._alike: dict[type, list[Any]] = {Leaf: [], Check: [], Branch: []}
+        self._alike: dict[type, list[Any]] = {Leaf: [], TreeCondition: [], Branch: []}
         self._place(self.root)
-        leaves, self.checks = self._alike[Leaf], self._alike[Check]
+        leaves, self.checks = self._alike[Leaf], self._alike[TreeCondition]
         if not leaves:
             raise PolicyError(f"{self.who} has no skill")
         self.skill_of = np.array([self.number(x.skill, ": a leaf", PolicyError) for x in leaves])

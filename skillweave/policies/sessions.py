@@ -9,8 +9,8 @@ from contextlib import suppress
 from functools import cache
 from typing import Any
 
+from .acting_errors import PolicyError
 from .core import Array
-from .errors import PolicyError
 
 MOST_FIELDS = 5_000_000
 """The most fields of an ONNX file, numbers of packed arrays not counted."""

@@ -15,10 +15,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from .acting_errors import PolicyError, SkillError, SkillweaveError
 from .core import Array
-from .errors import PolicyError, SkillError, SkillweaveError
-from .files import shown
 from .infos import NUMBERS
+from .untrusted import shown
 
 Kind = Literal["Box", "Discrete", "MultiDiscrete", "MultiBinary", "Dict", "Tuple"]
 MOST = 10**8

@@ -1,7 +1,7 @@
 """The lander of ``lander-missions``: up to three legs, and gusts.
 
-A mission is defined in one place, ``Progress``, for one environment (``Mission``) as for many
-side by side in EnvPool (``MissionPool``).
+A mission is defined in one place, ``MissionState``, for one environment (``MissionTask``) as for
+many side by side in EnvPool (``MissionPool``).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ GUST_STEPS = 8
 SIZE = 8 + LEGS * len(KINDS) + 1
 
 
-class Progress:
+class MissionState:
     """The progress of the missions of ``num_envs`` environments.
 
     Args:
@@ -130,14 +130,14 @@ class Progress:
 SPACE = gym.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
 
 
-class Mission(OwnTask):
+class MissionTask(OwnTask):
     """One lander with a mission; ``info["success"]`` is true where all of it is done."""
 
     def __init__(
         self, env: gym.Env[Any, Any], missions: Sequence[Sequence[str]], gusts: bool = False
     ) -> None:
         super().__init__(env)
-        self.progress = Progress(1, missions, gusts)
+        self.progress = MissionState(1, missions, gusts)
         self._me = np.zeros(1, np.int64)
         self._rng = np.random.default_rng()
         self.observation_space = SPACE
@@ -199,7 +199,7 @@ class MissionPool(PoolWrapper):
         self, pool: Any, missions: Sequence[Sequence[str]], gusts: bool, num_envs: int, seed: int
     ) -> None:
         super().__init__(pool, SPACE)
-        self.progress = Progress(num_envs, missions, gusts)
+        self.progress = MissionState(num_envs, missions, gusts)
         self._rngs = [np.random.default_rng([seed, i]) for i in range(num_envs)]
 
     def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
@@ -224,7 +224,7 @@ def make(
     lander = gym.make(
         LANDER, max_episode_steps=EPISODE, render_mode=render_mode, disable_env_checker=True
     )
-    return Mission(lander, missions, gusts)
+    return MissionTask(lander, missions, gusts)
 
 
 def many(

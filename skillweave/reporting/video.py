@@ -16,7 +16,7 @@ from skillweave._internal.messages import error_text
 from skillweave._internal.notebooks import Markup, joined, paragraph
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave._internal.terminal import printable
-from skillweave.envs.checks import LONG_EPISODE
+from skillweave.envs.checked import LONG_EPISODE
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
@@ -25,7 +25,7 @@ from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.schema import AtLeastOne, Count, fitted
-from skillweave.training.play import Played, SeededEpisodes, play
+from skillweave.training.play import PlayedStep, SeededEpisodes, play
 from skillweave.types import Array, Memory, Policy
 
 MAX_WIDTH = 960  # pixels; larger frames are reduced
@@ -116,7 +116,7 @@ class _Record:
         if self._elapsed % EVERY == 0:
             self._show("return")
 
-    def after_step(self, played: Played) -> None:
+    def after_step(self, played: PlayedStep) -> None:
         """Count the step, and show an episode's end."""
         self._elapsed += 1
         self._total += float(played.reward[0])

@@ -34,9 +34,9 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from skillweave._internal.messages import absolute, shown_path
-from skillweave.algorithms.policy import AgentHeader, AgentPolicy, state_from
+from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy, state_from
 from skillweave.errors import DeclarationError, RunError
-from skillweave.policies.files import shown
+from skillweave.policies.untrusted import shown
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import load_words, resume_words, saved_words
 from skillweave.runs.files import (

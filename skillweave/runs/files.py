@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from skillweave.errors import RunError
-from skillweave.policies.files import check_file, parse_json, read_file, shown
+from skillweave.policies.untrusted import check_file, parse_json, read_file, shown
 from skillweave.schema import as_json, fit
 
 SCHEMA = 1

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from skillweave._internal.paths import SELECTOR, decides, level_of, name_of
+from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.errors import DeclarationError, RunError
-from skillweave.policies.files import read_file
+from skillweave.policies.untrusted import read_file
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import (

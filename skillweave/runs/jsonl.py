@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.errors import RunError
-from skillweave.policies.files import check_file, load_json, shown
+from skillweave.policies.untrusted import check_file, load_json, shown
 from skillweave.runs.files import LARGEST_JSON, own_copy
 from skillweave.schema import as_json, fit
 

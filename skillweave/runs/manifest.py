@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
 
 from skillweave._internal.paths import level_of, names_in
+from skillweave.algorithms.agent_policy import AgentHeader
 from skillweave.algorithms.config import config_from_json
-from skillweave.algorithms.policy import AgentHeader
 from skillweave.errors import EnvError, RunError
-from skillweave.policies.files import shown
+from skillweave.policies.untrusted import shown
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.files import read_json, record_in
 from skillweave.schema import AtLeastOne, Check, Count, NonNegative, Positive, Threads, as_json

@@ -26,7 +26,7 @@ from gymnasium.envs.registration import load_env_creator
 from skillweave._internal.notices import notice
 from skillweave._internal.tracebacks import is_own_code, is_own_module
 from skillweave.envs.make import EnvSpec
-from skillweave.policies.files import checksum, shown
+from skillweave.policies.untrusted import checksum, shown
 from skillweave.skills import Reflex, Skill
 
 Texts = dict[str, str]

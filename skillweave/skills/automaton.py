@@ -15,9 +15,9 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError
 from skillweave.policies import selectors
-from skillweave.policies.errors import PolicyError
-from skillweave.policies.files import checksum
+from skillweave.policies.acting_errors import PolicyError
 from skillweave.policies.selectors import function_name, skill_and_goal
+from skillweave.policies.untrusted import checksum
 from skillweave.schema import Check, fitted
 from skillweave.skills.selector import ReadySelector, checked_function, goal_as_json
 from skillweave.types import Step
@@ -100,7 +100,7 @@ class Automaton(ReadySelector):
         ordered = {state: tuple(names) for state, names in self.states.items()}
         arrows = tuple((*pair, event) for pair, event in self.transitions.items())
         try:
-            selectors.Automaton("automaton", skills, {}, ordered, self.start_state, arrows)
+            selectors.StateMachine("automaton", skills, {}, ordered, self.start_state, arrows)
         except PolicyError as error:
             raise DeclarationError(str(error)) from None
 
@@ -111,7 +111,7 @@ class Automaton(ReadySelector):
                 yield f"state {short(state)}", name, self.goals.get((state, name))
 
     @cached_property
-    def in_place(self) -> selectors.Automaton:  # type: ignore[override]
+    def in_place(self) -> selectors.StateMachine:  # type: ignore[override]
         """The rule that acts."""
         ordered = (
             names if isinstance(names, tuple) else tuple(filter(names.__contains__, self.skills))
@@ -131,7 +131,7 @@ class Automaton(ReadySelector):
             (state, name, self._goal(name, goal, f"{self._who}: state {short(state)}"))
             for (state, name), goal in self.goals.items()
         )
-        return selectors.Automaton(*self._rule_of, states, self.start_state, transitions, goals)
+        return selectors.StateMachine(*self._rule_of, states, self.start_state, transitions, goals)
 
     def source(self) -> dict[str, Any]:
         """Return the checksum of its states and transitions, with only the names of functions."""

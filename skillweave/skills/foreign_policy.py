@@ -14,8 +14,8 @@ from skillweave._internal.messages import error_text, short
 from skillweave._internal.notices import notice
 from skillweave._internal.tracebacks import is_own_code
 from skillweave.errors import PolicyError, RunError, SkillweaveError
-from skillweave.policies.files import checksum
 from skillweave.policies.spaces import at, space_of
+from skillweave.policies.untrusted import checksum
 from skillweave.skills.function_state import examples
 from skillweave.skills.goal_spaces import draw_from
 from skillweave.skills.probing import look_at

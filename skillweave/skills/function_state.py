@@ -33,7 +33,7 @@ Attributes = list[tuple[dict[str, Any], dict[str, Any]]]
 """The dicts of attributes of objects, and their values at one time."""
 
 
-class State:
+class FunctionState:
     """What a function may change: attributes of the user's objects, and random generators.
 
     Args:
@@ -112,7 +112,7 @@ def untouched(thing: Any) -> Iterator[None]:
     Args:
         thing: a function or an object of the user.
     """
-    state = State(thing)
+    state = FunctionState(thing)
     with state.restored_afterwards():
         state.prepare()
         yield

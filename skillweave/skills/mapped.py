@@ -17,18 +17,18 @@ from gymnasium.spaces import Box, Dict, Tuple
 from skillweave._internal.messages import short
 from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.policies.core import Policy as InPlace, Turn, World
+from skillweave.policies.core import RowPolicy, Turn, World
 from skillweave.policies.functional import Functional
 from skillweave.policies.mapped import Function, Input, Mapped, Model, numbers_of
 from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.policies.spaces import Space as Data
+from skillweave.skills.fit_mapping import described, fitted_inputs, fitted_outputs, for_model
 from skillweave.skills.foreign_policy import EXAMPLES, SEES, Foreign, made_up
-from skillweave.skills.function_state import State, examples
+from skillweave.skills.function_state import FunctionState, examples
 from skillweave.skills.goal_spaces import with_goal, without_goal
 from skillweave.skills.goals import Goals
 from skillweave.skills.mapping import LastAction, PolicyMapping
 from skillweave.skills.outputs import Wrapped, of_numbers
-from skillweave.skills.plan import described, fitted_inputs, fitted_outputs, for_model
 from skillweave.skills.probing import MOST_BYTES
 from skillweave.skills.rows import largest_difference, other_rows, parts_of, shown
 from skillweave.types import Array, Memoryless
@@ -66,7 +66,7 @@ class MappedPolicy(Functional, Foreign, Model):
         return self
 
     @cached_property
-    def in_place(self) -> InPlace:  # type: ignore[override]
+    def in_place(self) -> RowPolicy:  # type: ignore[override]
         """The policy that acts, with the mapping fitted to the spaces.
 
         Raises:
@@ -237,7 +237,7 @@ def look_at_outputs(policy: MappedPolicy) -> None:
     every, twin = np.arange(len(obs)), policy.twin()
     before = twin.tensors()
     with examples(None), np.errstate(all="ignore"):
-        state = State(None)
+        state = FunctionState(None)
         first = twin.outputs(obs)
         if not first or any(x.shape[:1] != every.shape for x in first.values()):
             return  # it is an error where it acts

@@ -16,11 +16,11 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, shortened
 from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, RunError, needs_extra
-from skillweave.policies.core import Policy as InPlace
-from skillweave.policies.files import check_file
+from skillweave.policies.core import RowPolicy
 from skillweave.policies.mapped import OnnxFile, fits_shape
 from skillweave.policies.sessions import open_session
 from skillweave.policies.spaces import space_of
+from skillweave.policies.untrusted import check_file
 from skillweave.skills.foreign_policy import SEES
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
@@ -103,7 +103,7 @@ class OnnxPolicy(MappedPolicy):
         return bound
 
     @cached_property
-    def in_place(self) -> InPlace:  # type: ignore[override]
+    def in_place(self) -> RowPolicy:  # type: ignore[override]
         """The policy that acts, with the output of the actions chosen by its name.
 
         Where names do not decide, shapes do.

@@ -22,9 +22,10 @@ from gymnasium.spaces import Box, Dict, Discrete
 from skillweave._internal.messages import short, shortened, suggest
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.policies.mapped import Input
-from skillweave.policies.parts import Correction, Part
+from skillweave.policies.parts import Correction, Slice
 from skillweave.policies.spaces import Space as Data, space_of
 from skillweave.schema import as_json
+from skillweave.skills.fit_mapping import fitted_inputs, places_in
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.mapping import (
     Acts,
@@ -34,7 +35,6 @@ from skillweave.skills.mapping import (
     to_json,
 )
 from skillweave.skills.outputs import required_arguments
-from skillweave.skills.plan import fitted_inputs, places_in
 from skillweave.skills.residual import Residual
 from skillweave.types import Array, Policy
 
@@ -330,7 +330,7 @@ class OwnPart:
         self.action_space: Space[Any] = self.written_space
         """Of its own actions."""
         spaces = space_of(action_space), space_of(self.written_space)
-        self.part = Part(*spaces, axes=len(observation_space.shape or ()), who=who, **how)
+        self.part = Slice(*spaces, axes=len(observation_space.shape or ()), who=who, **how)
         """What acts."""
 
     def to_json(self) -> dict[str, Any]:

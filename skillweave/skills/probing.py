@@ -28,7 +28,7 @@ from skillweave._internal.messages import error_text
 from skillweave._internal.notices import notice
 from skillweave._internal.tracebacks import is_own_code
 from skillweave.errors import SkillError, SkillweaveError
-from skillweave.skills.function_state import MODE, State
+from skillweave.skills.function_state import MODE, FunctionState
 from skillweave.skills.rows import (
     Call,
     as_type,
@@ -134,7 +134,7 @@ class Look:
 
     def __init__(self, call: Call, judges: bool | None, before: int, *, wide: bool) -> None:
         self._call, self._judges, self._before, self._wide = call, judges, before, wide
-        self._state = State(call.owner or call.function, call.fixed)
+        self._state = FunctionState(call.owner or call.function, call.fixed)
 
     def check(self, answer: Any, who: str, kind: type[SkillweaveError]) -> None:
         """Compare the answer that the function has just given.

@@ -17,8 +17,8 @@ from skillweave._internal.messages import error_text, short, shortened
 from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, needs_extra
 from skillweave.policies.core import Turn
-from skillweave.policies.files import check_file, checksum, read_file
 from skillweave.policies.mapped import Mapped, Shapes
+from skillweave.policies.untrusted import check_file, checksum, read_file
 from skillweave.schema import fitted
 from skillweave.skills.foreign_policy import made_up
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of, no_mapping

@@ -11,7 +11,7 @@ from gymnasium.spaces import Dict, Tuple
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError, PolicyError
-from skillweave.policies.core import Memory, Policy as InPlace, Turn
+from skillweave.policies.core import Memory, RowPolicy, Turn
 from skillweave.policies.mapped import Function
 from skillweave.policies.parts import GOAL
 from skillweave.skills.foreign_policy import qualified
@@ -51,7 +51,7 @@ class ScriptedPolicy(MappedPolicy):
         return Function(Wrapped(self.function, self._ask), *how)
 
     @cached_property
-    def in_place(self) -> InPlace:  # type: ignore[override]
+    def in_place(self) -> RowPolicy:  # type: ignore[override]
         """The policy that acts: the function alone, while its action space is not known."""
         if self.action_space is None and self.mapping == PolicyMapping():
             return _Alone(self._ask)
@@ -95,7 +95,7 @@ class ScriptedPolicy(MappedPolicy):
         return as_array(value, who, PolicyError)
 
 
-class _Alone(InPlace):
+class _Alone(RowPolicy):
     """A function whose action space is not known."""
 
     def __init__(self, function: Callable[[Array], Any]) -> None:

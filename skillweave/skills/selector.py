@@ -17,19 +17,19 @@ from skillweave._internal.terminal import one_line
 from skillweave.errors import DeclarationError
 from skillweave.policies import selectors
 from skillweave.policies.core import LastCall
-from skillweave.policies.files import checksum
 from skillweave.policies.functional import Functional
 from skillweave.policies.parts import GOAL
 from skillweave.policies.selectors import (
     Asked,
     Branch,
-    Check,
     Leaf,
     Rule,
+    TreeCondition,
     function_name,
     skill_and_goal,
 )
 from skillweave.policies.spaces import space_of
+from skillweave.policies.untrusted import checksum
 from skillweave.skills.foreign_policy import Foreign, made_up, qualified
 from skillweave.skills.function_state import examples
 from skillweave.skills.goal_spaces import alone
@@ -225,7 +225,7 @@ class TreeSelector(ReadySelector):
 
     def _node(self, node: Node) -> selectors.Node:
         if isinstance(node, Condition):
-            return Check(node.name, checked_function(node.function, self._who, node.name))
+            return TreeCondition(node.name, checked_function(node.function, self._who, node.name))
         if isinstance(node, Composite):
             children = tuple(map(self._node, node.children))
             return Branch(

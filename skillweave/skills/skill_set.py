@@ -9,9 +9,9 @@ from typing import Any
 import gymnasium as gym
 
 from skillweave.errors import PolicyError
-from skillweave.policies.core import Choices, Policy, innermost
+from skillweave.policies.core import Choices, RowPolicy, innermost
 from skillweave.policies.functional import Functional, Returns
-from skillweave.policies.hierarchy import ActiveGuide, CalledSkill, Hierarchy, Interruption
+from skillweave.policies.hierarchy import ActiveGuide, CallAndReturn, CalledSkill, Interruption
 from skillweave.policies.parts import Corrects, Given, Joined, PartOf, Reflexes, Remembers
 from skillweave.policies.spaces import space_of
 from skillweave.skills import Reflex, Skill, path_of
@@ -63,7 +63,7 @@ class SkillSet(LimitedCalls):
         return choice_space(self.choices, goal_spaces, [s.name for s in self.skills])
 
     @cached_property
-    def hierarchy(self) -> Hierarchy:
+    def hierarchy(self) -> CallAndReturn:
         """The skills in calls, without a selector."""
         return within(acting_policy(self, outermost=False))
 
@@ -98,7 +98,7 @@ def acting_policy(
     goals: Goals | None = None,
     *,
     outermost: bool = True,
-) -> Policy:
+) -> RowPolicy:
     """Return skills in calls, with reflexes.
 
     Args:
@@ -111,7 +111,7 @@ def acting_policy(
     """
     if guide is not None and guide.decides:
         selector, guide = guide.selector, None
-    policy: Policy = Hierarchy(
+    policy: RowPolicy = CallAndReturn(
         None if selector is None else in_place(selector, "the selector's act()"),
         tuple(_skill(skills, i) for i in range(len(skills.skills))),
         lengths=skills.lengths,
@@ -127,7 +127,7 @@ def acting_policy(
     return _remembering(policy, skills) if outermost else policy
 
 
-def acting_alone(skills: SkillSet, i: int) -> Policy:
+def acting_alone(skills: SkillSet, i: int) -> RowPolicy:
     """Return the policy of skill ``i`` without a selector, with reflexes."""
     skill, space = skills.skills[i], skills.action_space
     policy = acting_apart(skills.policies[i], skill, skills.part(i), skills.reflexes, space)
@@ -135,16 +135,16 @@ def acting_alone(skills: SkillSet, i: int) -> Policy:
     return _remembering(policy if goals is None else Given(policy, goals), skills)
 
 
-def within(policy: Policy) -> Hierarchy:
+def within(policy: RowPolicy) -> CallAndReturn:
     """Return the hierarchy that reflexes and the like stand around."""
     inside = innermost(policy)
-    assert isinstance(inside, Hierarchy)
+    assert isinstance(inside, CallAndReturn)
     return inside
 
 
-def in_place(policy: Any, who: str = "the policy's act()") -> Policy:
+def in_place(policy: Any, who: str = "the policy's act()") -> RowPolicy:
     """Return a policy of any form as one whose memory is changed in place; ``who`` for messages."""
-    if isinstance(policy, Policy):
+    if isinstance(policy, RowPolicy):
         return policy
     if isinstance(policy, Functional) and policy.is_plain:
         return policy.in_place
@@ -158,7 +158,7 @@ def acting_apart(
     part: OwnPart | None,
     reflexes: tuple[Reflex, ...],
     space: gym.Space[Any],
-) -> Policy:
+) -> RowPolicy:
     """Return the policy of a skill that acts by itself, or of a plain agent, with reflexes.
 
     Args:
@@ -172,13 +172,15 @@ def acting_apart(
     return _overridden(whole, reflexes, space) if reflexes else whole
 
 
-def _overridden(policy: Policy, reflexes: tuple[Reflex, ...], space: gym.Space[Any]) -> Policy:
+def _overridden(
+    policy: RowPolicy, reflexes: tuple[Reflex, ...], space: gym.Space[Any]
+) -> RowPolicy:
     """Return a policy with reflexes."""
     acts = space_of(space)
     return Reflexes(policy, tuple(reflex.override(acts) for reflex in reflexes), acts)
 
 
-def _whole(policy: Any, skill: Skill | None, part: OwnPart | None) -> Policy:
+def _whole(policy: Any, skill: Skill | None, part: OwnPart | None) -> RowPolicy:
     """Return a skill's policy, whose actions are whole ones."""
     who = "" if skill is None else f"skill {path_of(skill)!r}: its policy's act()"
     found = policy_of(policy, goals_of(skill), part, who)
@@ -195,14 +197,14 @@ def _skill(skills: SkillSet, i: int) -> CalledSkill:
     )
 
 
-def _remembering(policy: Policy, skills: SkillSet) -> Policy:
+def _remembering(policy: RowPolicy, skills: SkillSet) -> RowPolicy:
     """Return a policy that remembers the last action where that counts."""
     return Remembers(policy, space_of(skills.action_space)) if policy.holds else policy
 
 
 def policy_of(
     policy: Any, goals: Goals | None, part: OwnPart | None, who: str, *, outermost: bool = False
-) -> Policy:
+) -> RowPolicy:
     """Return a skill's policy, whose actions are those of its own part.
 
     Args:
@@ -212,7 +214,7 @@ def policy_of(
         outermost: see ``acting_policy``.
     """
     if policy is None:
-        return Policy()
+        return RowPolicy()
     known = isinstance(policy, Functional) and policy.is_plain
     if hasattr(policy, "act"):
         inside, joins = in_place(policy, who), not (known and policy.joins)
@@ -234,7 +236,7 @@ ENDS = ("initiation", "termination", "success")
 """The methods of a skill that are asked while it acts."""
 
 
-def _check_memory(policy: Policy) -> None:
+def _check_memory(policy: RowPolicy) -> None:
     """Raise a PolicyError where a checkpoint could not hold what a policy remembers."""
     if not isinstance(policy, Returns):
         return

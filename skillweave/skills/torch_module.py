@@ -18,8 +18,8 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, shortened
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.policies.core import Turn
-from skillweave.policies.files import checksum, read_file
 from skillweave.policies.mapped import invoke, of_model, parted, rows_first, states_of
+from skillweave.policies.untrusted import checksum, read_file
 from skillweave.schema import fitted
 from skillweave.skills.foreign_policy import made_up, qualified
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, layers_of, no_mapping

@@ -9,10 +9,10 @@ import numpy as np
 
 from skillweave.errors import PolicyError, RunError
 from skillweave.policies.codec import Reader, Written
-from skillweave.policies.files import shown
 from skillweave.policies.hierarchy import SKILL
 from skillweave.policies.parts import GOAL
 from skillweave.policies.spaces import MOST, Space, space_of
+from skillweave.policies.untrusted import shown
 from skillweave.schema import fit
 from skillweave.spaces.choices import ChoiceSpace
 from skillweave.spaces.observations import image_layout

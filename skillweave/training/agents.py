@@ -15,18 +15,18 @@ from torch import Tensor
 from skillweave._internal.paths import CRITIC, SELECTOR, decides, level_of, relative
 from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds, global_generators, seed_global_generators
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm, state_from
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.batches import Reference
 from skillweave.algorithms.config import config_from_json
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
-from skillweave.envs.checks import longest_evaluation
+from skillweave.envs.checked import longest_evaluation
 from skillweave.envs.engine import Engine
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.acting import Acting, Request
 from skillweave.experience.collector import Collector
 from skillweave.ops.device import resolve_device
 from skillweave.ops.threads import torch_threads
-from skillweave.policies.files import shown
+from skillweave.policies.untrusted import shown
 from skillweave.runs.initial_policies import initial_policy
 from skillweave.runs.manifest import StageEntry
 from skillweave.schema import fit
@@ -35,7 +35,7 @@ from skillweave.training.joint import JointLearner
 from skillweave.training.keep_best import KeepBest
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
 from skillweave.training.learning_task import LearningTask
-from skillweave.training.loop import Loop, Progress, Saved
+from skillweave.training.loop import Loop, LoopState, Saved
 from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 from skillweave.training.rehearsal import rehearse
 from skillweave.training.replay_learner import learner_of
@@ -161,7 +161,7 @@ class Agents:
             Episodes(self.task.log_info),
             self.stage.seeds,
             self.entry.budget,
-            Progress(log.at.update, log.at.steps, log.at.seconds),
+            LoopState(log.at.update, log.at.steps, log.at.seconds),
             checkpoint_every=log.run.manifest.checkpoint_every,
             on_tick=self._on_tick,
             on_checkpoint=self._on_checkpoint,

@@ -19,9 +19,9 @@ from skillweave._internal.notebooks import joined, paragraph, table
 from skillweave._internal.notices import notice
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave._internal.terminal import printable
-from skillweave.envs.checks import longest_evaluation, time_limit
+from skillweave.envs.checked import longest_evaluation, time_limit
 from skillweave.envs.engine import Engine, checksums
-from skillweave.envs.infos import notice_odd_success, reported_success
+from skillweave.envs.env_infos import notice_odd_success, reported_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.envs.pool import POOL_SEEDS
 from skillweave.errors import DeclarationError, SkillweaveError
@@ -33,7 +33,7 @@ from skillweave.skills.foreign_policy import Foreign, check_spaces
 from skillweave.skills.goals import goals_of
 from skillweave.skills.ready import as_policy
 from skillweave.skills.skill_set import skills_below
-from skillweave.training.play import Played, SeededEpisodes, play
+from skillweave.training.play import PlayedStep, SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.training.skill_report import (
     TITLES,
@@ -302,7 +302,7 @@ def evaluate(
     deterministic: bool = True,
     num_envs: int | None = None,
     max_steps: int | None = None,
-    watch: Callable[[Played], None] | None = None,
+    watch: Callable[[PlayedStep], None] | None = None,
     engine: EngineName = "sync",
     log_calls: bool = False,
     info: Sequence[str] = (),
@@ -396,7 +396,7 @@ def _describe(spec: EnvSpec) -> tuple[int | None, float | None, bool]:
         return time_limit(env), threshold, in_pool(spec, env)
 
 
-def _with_notice(moments: Iterator[Played], name: str, most: int) -> Iterator[Played]:
+def _with_notice(moments: Iterator[PlayedStep], name: str, most: int) -> Iterator[PlayedStep]:
     """Yield what is played; give a notice once where an episode seems never to end.
 
     Args:
@@ -458,8 +458,8 @@ def episode_seeds(seed: int, episodes: int) -> list[int]:
 def _scored(
     policy: Any,
     episodes: int,
-    moments: Iterator[Played],
-    watch: Callable[[Played], None] | None,
+    moments: Iterator[PlayedStep],
+    watch: Callable[[PlayedStep], None] | None,
     threshold: float | None,
     calls: PlayedCalls,
 ) -> Evaluation:
@@ -517,7 +517,7 @@ class SameEpisodes:
         """All episodes so far are the same in every step."""
         self._steps: list[int] = []  # a checksum of each
 
-    def see(self, played: Played) -> None:
+    def see(self, played: PlayedStep) -> None:
         """Compare the next step of some episodes."""
         if not self.so_far:
             return

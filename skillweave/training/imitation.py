@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError
 from skillweave.ops.distributions import mask_logits

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from skillweave._internal.prefixes import prefixed, unprefixed
-from skillweave.algorithms.policy import state_from
+from skillweave.algorithms.agent_policy import state_from
 from skillweave.runs.manifest import BestSoFar
 
 

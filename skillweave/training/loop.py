@@ -39,7 +39,7 @@ CHECKPOINT_SHARE = 0.05
 
 
 @dataclass
-class Report:
+class PendingReport:
     """Pending report of an update that has started."""
 
     update: int  # its number, from 1 on
@@ -49,7 +49,7 @@ class Report:
 
 
 @dataclass
-class Progress:
+class LoopState:
     """Counts and pending metrics of a stage's training."""
 
     update: int = 0
@@ -57,14 +57,14 @@ class Progress:
     seconds: float = 0.0
     reported: int = 0
     """Environment steps at the latest report."""
-    report: Report | None = None
+    report: PendingReport | None = None
     """Report of the latest update, until it is written."""
     metrics: dict[str, Tensor] = field(default_factory=dict)
     """Latest value of each metric, (P,), since the latest report."""
 
     def state(self) -> dict[str, Tensor]:
         """Return tensors for a checkpoint, beside ``update``, ``steps`` and ``seconds``."""
-        report = self.report or Report(0, 0, False, {})
+        report = self.report or PendingReport(0, 0, False, {})
         numbers = [self.reported, report.update, report.steps, int(report.due)]
         summary = {
             k: torch.tensor(v, dtype=torch.float64, device="cpu") for k, v in report.summary.items()
@@ -97,14 +97,14 @@ class Progress:
         self.reported = reported
         self.metrics = metrics
         means = {k: float(v) for k, v in summary.items()}
-        self.report = Report(update, steps, bool(due), means) if update else None
+        self.report = PendingReport(update, steps, bool(due), means) if update else None
 
 
 @dataclass
 class Saved:
     """Content of a checkpoint, beside the states of the stacks."""
 
-    at: Progress
+    at: LoopState
     extra: dict[str, Tensor]  # environments, replay, and the rows that are requested
 
 
@@ -120,7 +120,7 @@ class Loop:
     seeds: Seeds
     budget: int
     """Environment steps."""
-    at: Progress = field(default_factory=Progress)
+    at: LoopState = field(default_factory=LoopState)
     """The counts so far."""
     schedule_steps: int | None = None
     """The part of the budget at which schedules end; None: all of it."""
@@ -161,7 +161,7 @@ class Loop:
         self.learner.cut(restarted)
         return restarted
 
-    def run(self) -> Progress:
+    def run(self) -> LoopState:
         """Train until the ``budget`` is spent; return the counts at the end.
 
         Raises:
@@ -220,7 +220,7 @@ class Loop:
         arguments = update, self.at.steps, self._progress()
         # The means of episodes are of this moment, whatever the length of the update.
         summary = self.episodes.summary() if due and self.on_tick is not None else {}
-        self.at.report = Report(update + 1, self.at.steps, due, summary)
+        self.at.report = PendingReport(update + 1, self.at.steps, due, summary)
         if self.learner.overlap:
             self._pending = self._thread.submit(self.learner.learn, *arguments)
         else:

@@ -9,10 +9,10 @@ from typing import Any, cast
 import numpy as np
 
 from skillweave._internal.seeding import Seeds, global_generators
-from skillweave.algorithms.policy import AgentPolicy
-from skillweave.envs.checks import longest_evaluation
+from skillweave.algorithms.agent_policy import AgentPolicy
+from skillweave.envs.checked import longest_evaluation
 from skillweave.envs.engine import Engine, GymnasiumEngine, RawStep, episode_seed
-from skillweave.envs.infos import allowed_rows
+from skillweave.envs.env_infos import allowed_rows
 from skillweave.errors import SkillweaveError, reworded
 from skillweave.experience.acting import Acting, Request
 from skillweave.experience.collector import RETURN, SUCCESS, Collector

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.paths import AGENT
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmSettings, check_spaces
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.envs.make import EnvSpec, Spaces
 from skillweave.runs.command_words import Caller
 from skillweave.runs.directory import RunDirectory
@@ -19,8 +19,8 @@ from skillweave.runs.manifest import Manifest
 from skillweave.runs.user_code import environment_texts
 from skillweave.schema import AtLeastOne, Share, check_fields
 from skillweave.spaces import action_codec
-from skillweave.training.checks import EnvValue, check_env, check_rollout
 from skillweave.training.defaults import TrainDefaults
+from skillweave.training.env_check import EnvValue, check_env, check_rollout
 from skillweave.training.learning_task import skill_task
 from skillweave.training.options import Reports
 from skillweave.training.role import agent_role

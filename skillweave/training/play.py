@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from skillweave.envs.engine import Engine
-from skillweave.envs.infos import allowed_rows
+from skillweave.envs.env_infos import allowed_rows
 from skillweave.policies.core import Memory as InPlaceMemory, Turn, World, flat, put, split, take
 from skillweave.skills.skill_set import in_place
 from skillweave.types import Array, Policy, Step
 
 
 @dataclass(slots=True)
-class Played:
+class PlayedStep:
     """One step in each environment that acts; arrays have a row for each of these."""
 
     rows: Array  # (k,) int64, the environments
@@ -45,7 +45,7 @@ def play(
     rng: np.random.Generator | None = None,
     before_step: Callable[[InPlaceMemory], None] | None = None,
     seed: int = 0,
-) -> Iterator[Played]:
+) -> Iterator[PlayedStep]:
     """Play all episodes, a step at a time.
 
     Args:
@@ -112,7 +112,7 @@ class SeededEpisodes:
         self.obs = np.array(first)
         """(N, *obs_shape), the next observations."""
 
-    def step(self, action: Array) -> Played:
+    def step(self, action: Array) -> PlayedStep:
         """Act in ``rows``."""
         rows = self.rows
         obs = self.obs[rows]
@@ -123,9 +123,9 @@ class SeededEpisodes:
         step = raw.seen(obs, action, elapsed)
         cut = ~(raw.terminated | raw.truncated) & (elapsed >= self._max_steps)
         one = np.ones(len(rows), np.int64)
-        return Played(rows, self.episode[rows], step, raw.reward, one, cut)
+        return PlayedStep(rows, self.episode[rows], step, raw.reward, one, cut)
 
-    def go_on(self, played: Played) -> Array:
+    def go_on(self, played: PlayedStep) -> Array:
         """Start remaining episodes where others are over; return these environments (m,)."""
         ended = played.rows[played.over]
         first = self._upcoming

@@ -21,7 +21,7 @@ from skillweave.skills import Reflex, Skill, asked
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.skill_set import SkillSet, skills_below
-from skillweave.training.play import Played
+from skillweave.training.play import PlayedStep
 from skillweave.types import Array, Memory, Policy
 
 WAITS, IS_DONE = -1, -2
@@ -91,7 +91,7 @@ class PlayedCalls:
         }
         """Steps in which each reflex acted, by its path."""
 
-    def add(self, played: Played) -> None:
+    def add(self, played: PlayedStep) -> None:
         """Record a step of each environment; the first one is of all of them."""
         if self._feed is None:
             self._feed = TraceFeed(list(self._recorders(len(played.rows)).values()))
@@ -146,7 +146,7 @@ class PlayedCalls:
             recorders[""].limits = (self.alone.max_steps,)
         return recorders
 
-    def _calls(self, path: str, played: Played) -> Memory:
+    def _calls(self, path: str, played: PlayedStep) -> Memory:
         """Return what a level's calls did in a step."""
         if self.alone is not None and not path:
             return self._of_alone(self.alone, played)
@@ -167,7 +167,7 @@ class PlayedCalls:
             calls["end"] = np.where(cut, np.int8(EPISODE), calls["end"])
         return calls
 
-    def _of_alone(self, skill: Skill, played: Played) -> Memory:
+    def _of_alone(self, skill: Skill, played: PlayedStep) -> Memory:
         """Return what the calls of a skill that acts alone did in a step."""
         rows, step = played.rows, played.step
         tau = self._tau[rows]
@@ -196,7 +196,7 @@ class PlayedCalls:
         """Return the path of a reflex: a skill that acts alone is no level of it."""
         return join(*names_in(path)[self.alone is not None :], str(reflex.name))
 
-    def _count_reflexes(self, played: Played, levels: dict[str, Memory]) -> None:
+    def _count_reflexes(self, played: PlayedStep, levels: dict[str, Memory]) -> None:
         """Count the reflexes that acted: where several hold, the last of the outermost level."""
         if not self.reflexes:
             return

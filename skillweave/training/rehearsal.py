@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.batches import Rehearsal
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.errors import RunError
 from skillweave.runs.directory import RunDirectory

@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 from skillweave._internal.notices import notice
 from skillweave._internal.paths import SELECTOR, join
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import (
     AlgorithmConfig,
     config_from_json,
     config_to_json,
     own_encoders,
 )
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.schedules import own_schedules
 from skillweave.envs.make import EnvSpec, cores, workers_for
 from skillweave.errors import DeclarationError, SkillweaveError, reworded

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from skillweave._internal.messages import suggest
 from skillweave._internal.notices import notice
-from skillweave.algorithms.policy import AgentPolicy
-from skillweave.envs.checks import LONG_EPISODE, LONGEST_EPISODE
+from skillweave.algorithms.agent_policy import AgentPolicy
+from skillweave.envs.checked import LONG_EPISODE, LONGEST_EPISODE
 from skillweave.errors import RunError, SkillweaveError, reworded
-from skillweave.policies.files import shown
+from skillweave.policies.untrusted import shown
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import LINES, RunDirectory
 from skillweave.runs.manifest import Best, BestSoFar, Checkpoint, Reached, StageEntry, Stopped

@@ -9,8 +9,8 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.planning.recorder import Recorder
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import StageEntry

@@ -10,7 +10,7 @@ from skillweave._internal.interrupts import deferred
 from skillweave._internal.notices import notice
 from skillweave._internal.paths import names_in
 from skillweave._internal.seeding import Seeds, global_generators
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.planning.recorder import Recorder
 from skillweave.planning.run_log import save_calls
 from skillweave.runs.directory import RunDirectory

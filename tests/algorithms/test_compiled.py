@@ -19,9 +19,9 @@ from toys import transitions
 from skillweave import DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO, SkillweaveError
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import register_encoder
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.batches import Reference, Rehearsal, Rollout
 from skillweave.algorithms.compiled import Compiled
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.errors import DeclarationError
 from skillweave.workers.shipping import packed, unpacked
 

@@ -27,6 +27,7 @@ from toys import (
 
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import config as table
+from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy, make_algorithm
 from skillweave.algorithms.config import (
     DQN,
     PPO,
@@ -37,7 +38,6 @@ from skillweave.algorithms.config import (
     OnPolicy,
     SelfImitationPPO,
 )
-from skillweave.algorithms.policy import AgentHeader, AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.collector import Collector

@@ -9,6 +9,7 @@ from gymnasium.spaces import Box, Discrete
 
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.actor_critic import Critics
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.config import (
     DQN,
@@ -20,7 +21,6 @@ from skillweave.algorithms.config import (
     config_to_json,
 )
 from skillweave.algorithms.parameters import LARGEST
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.errors import DeclarationError, RunError
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.spaces import obs_codec

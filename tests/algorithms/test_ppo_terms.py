@@ -12,8 +12,8 @@ from toys import Toy, learn, rollout_of
 from skillweave import PPO, Network
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import ppo
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.parameters import epsilon_now
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import RehearsalRows, Terms
 from skillweave.errors import DeclarationError
 from skillweave.networks.heads import ActionHead

@@ -10,8 +10,8 @@ from toys import rollout_of
 
 from skillweave import PPO, RNN, Network
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.batches import Reference, Rollout
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.ppo import Terms
 
 SEEN = gym.spaces.Box(-1, 1, (3,), np.float32)

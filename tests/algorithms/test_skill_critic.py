@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.batches import Rollout
 from skillweave.algorithms.config import SkillCritic
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.networks.config import Network
 
 SEEN = gym.spaces.Box(0, 1, (3,), np.float32)

@@ -14,8 +14,8 @@ from toys import Echo, learn
 
 from skillweave import Apart, Hierarchy, TrainDefaults
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import DQN, PPO, SAC, TD3
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.evolution import Evolution
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.ops.threads import torch_threads

@@ -19,8 +19,8 @@ from toys import calling_in
 
 from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.experience.calls import SMOOTHED
-from skillweave.hierarchy.options import OptionsEnv
+from skillweave.experience.decisions import SMOOTHED
+from skillweave.hierarchy.options_env import OptionsEnv
 from skillweave.policies.core import CallEnd
 from skillweave.skills import Skill
 from skillweave.skills.skill_set import SkillSet

@@ -11,7 +11,7 @@ import pytest
 import skillweave as sw
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
-from skillweave.policies.core import Around, Policy, flat
+from skillweave.policies.core import Around, RowPolicy, flat
 from skillweave.policies.parts import Corrects
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.skill_set import SkillSet
@@ -197,17 +197,17 @@ def test_a_choice_that_is_none_is_refused(choice: int) -> None:
 
 
 def test_a_combinator_forwards_all_that_a_policy_has() -> None:
-    for name, value in vars(Policy).items():
+    for name, value in vars(RowPolicy).items():
         assert not callable(value) or vars(Around)[name] is not value
-    probe = type("Probe", (Policy,), {name: lambda *_, n=name: n for name in vars(Policy)
-                                      if callable(vars(Policy)[name])})()  # fmt: skip
-    for name, value in vars(Policy).items():
+    probe = type("Probe", (RowPolicy,), {name: lambda *_, n=name: n for name in vars(RowPolicy)
+                                      if callable(vars(RowPolicy)[name])})()  # fmt: skip
+    for name, value in vars(RowPolicy).items():
         if callable(value):
             assert getattr(Around(probe), name)() == name
 
 
 def test_a_correction_says_what_numbers_both_may_remember() -> None:
-    one = type("One", (Policy,), {"start": lambda self, n: {"state": np.zeros(n, np.int64)},
+    one = type("One", (RowPolicy,), {"start": lambda self, n: {"state": np.zeros(n, np.int64)},
                                   "values": lambda self: {"state": range(3)}})  # fmt: skip
     both = Corrects(one(), one(), None)  # type: ignore[arg-type]
     assert both.values() == {"own.state": range(3), "base.state": range(3)}

@@ -28,7 +28,7 @@ from skillweave.export import compile
 from skillweave.export.graphs import examples, mask_width
 from skillweave.export.runner import Runner
 from skillweave.export.write import Export, write_export
-from skillweave.hierarchy.options import OptionsEnv
+from skillweave.hierarchy.options_env import OptionsEnv
 from skillweave.policies import leaves as policy_leaves
 from skillweave.policies.core import Memory, Turn, World as Acting, flat, restart, take
 from skillweave.policies.spaces import space_of
@@ -393,7 +393,7 @@ class Session:
         noise = (("gumbel", 1),) if sampled else ()
         spaces = map(space_of, (net.observation_space, net.action_space))
         width = mask_width(net.action_space)
-        return policy_leaves.Network(content, *spaces, width, net.size, noise)
+        return policy_leaves.OnnxNetwork(content, *spaces, width, net.size, noise)
 
     def get_inputs(self) -> list[Any]:
         kinds = {"f": "float", "i": "int64"}

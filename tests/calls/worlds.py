@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
 
 import skillweave as sw
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.hierarchy.assembly import assembled, learning_set
 from skillweave.hierarchy.fitting import active_guide, ready_policies, ready_selectors
 from skillweave.hierarchy.policy import HierarchyPolicy

@@ -72,4 +72,4 @@ def test_words_for_numbers() -> None:
     assert shares({"left": 0.4, "land": 0.6}) == "left 40%, land 60%"
     score: Any = SimpleNamespace(returns=(1.0, 0.6667, 0.9999, 0.0))
     assert complete(score) == 0.5
-    assert commands.name_of(commands.Demo) == "demo"
+    assert commands.name_of(commands.DemoCommand) == "demo"

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from skillweave.cli.processes import ProcessEnded, Processes
+from skillweave.cli.jobs import ProcessEnded, Processes
 from skillweave.errors import SkillweaveError
 
 

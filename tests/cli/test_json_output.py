@@ -152,7 +152,7 @@ def test_numbers_that_json_lacks_are_null(
     def numbers(command: Any) -> Any:
         return {"a": [float("nan"), 1.5], "b": float("inf")}, ""
 
-    monkeypatch.setitem(execute.WAYS, commands.List, numbers)
+    monkeypatch.setitem(execute.WAYS, commands.ListCommand, numbers)
     assert main(["list", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"a": [None, 1.5], "b": None}
 

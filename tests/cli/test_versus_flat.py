@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from cli.test_cli import PLAIN
 
-from skillweave.cli import main, training
-from skillweave.cli.training import _verdict
+from skillweave.cli import main, training_commands
+from skillweave.cli.training_commands import _verdict
 
 
 def told(mean: float, low: float, high: float) -> dict[str, Any]:
@@ -53,14 +53,14 @@ def test_what_the_hierarchy_scored_is_told_before_the_flat_agent_is_trained(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "plain.py").write_text(PLAIN)
-    train = training._trained
+    train = training_commands._trained
 
     def stopped(command: Any, hierarchy: Any, flat: bool, *more: Any, **named: Any) -> Any:
         if flat:
             raise KeyboardInterrupt("stopped")
         return train(command, hierarchy, flat, *more, **named)
 
-    monkeypatch.setattr(training, "_trained", stopped)
+    monkeypatch.setattr(training_commands, "_trained", stopped)
     asked = ["train", str(tmp_path / "plain.py"), "-o", str(tmp_path / "run"), "--versus-flat"]
     assert main([*asked, "--quiet", "--evaluate", "4"]) == 130
     assert "over 4 episodes" in capsys.readouterr().out

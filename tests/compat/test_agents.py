@@ -173,7 +173,7 @@ def test_a_checkpoint_is_the_agent_it_was(kind, tmp_path):
 
 
 def test_a_checkpoint_is_a_native_policy(tmp_path):
-    from skillweave.algorithms.policy import AgentHeader, AgentPolicy
+    from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy
     from skillweave.runs.files import read_tensors, record_in
 
     agent = KINDS["ppo"]()

@@ -17,7 +17,7 @@ import pytest
 import torch
 from torch import nn
 
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.cli import main
 from skillweave.compat import pickles
 from skillweave.compat.agilerl.algorithms.dqn import DQN

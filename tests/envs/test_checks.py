@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from skillweave.envs.checks import CheckedEnv, Watch, time_limit
+from skillweave.envs.checked import CheckedEnv, Watch, time_limit
 from skillweave.envs.engine import RawStep
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import EnvError

@@ -7,13 +7,13 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from toys import alone_in, calling_in
 
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import PPO
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.envs.engine import checksums
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.experience.acting import Acting, Request
-from skillweave.hierarchy.options import OptionsEnv
+from skillweave.hierarchy.options_env import OptionsEnv
 from skillweave.networks.config import CNN, Network
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy

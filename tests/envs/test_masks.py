@@ -22,8 +22,8 @@ from skillweave import (
     evaluate,
 )
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.policy import make_algorithm
-from skillweave.envs.infos import ActionMasks, random_actions
+from skillweave.algorithms.agent_policy import make_algorithm
+from skillweave.envs.env_infos import ActionMasks, random_actions
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import EnvError
 from skillweave.experience.acting import Acting, Request

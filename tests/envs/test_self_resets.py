@@ -6,8 +6,8 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 import skillweave as sw
-from skillweave.envs.checks import LAST_OBSERVATIONS
-from skillweave.envs.infos import batched_infos, info_numbers, reported_success
+from skillweave.envs.checked import LAST_OBSERVATIONS
+from skillweave.envs.env_infos import batched_infos, info_numbers, reported_success
 from skillweave.envs.make import make_engine
 from skillweave.planning import Mission
 from skillweave.planning.mission import as_task

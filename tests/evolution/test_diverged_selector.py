@@ -6,7 +6,7 @@ from small_runs import interrupt_at_checkpoint
 
 from skillweave import PPO, Apart, EnvSpec, Hierarchy, Network, Skill
 from skillweave.evolution import Evolution
-from skillweave.evolution.part import Part
+from skillweave.evolution.shard import Shard
 from skillweave.runs.files import read_tensors
 
 
@@ -42,7 +42,7 @@ def declare():
 def test_who_takes_its_place_goes_on_with_calls_that_it_can_learn_from(
     checkpoint, tmp_path, monkeypatch
 ):
-    path, joined, poisoned = tmp_path / "run", Part._stack, []
+    path, joined, poisoned = tmp_path / "run", Shard._stack, []
 
     def poison(self, group):
         stack = joined(self, group)
@@ -53,7 +53,7 @@ def test_who_takes_its_place_goes_on_with_calls_that_it_can_learn_from(
 
     evolve = Evolution(population=3, generations=3, episodes=2)
     with monkeypatch.context() as patched:
-        patched.setattr(Part, "_stack", poison)
+        patched.setattr(Shard, "_stack", poison)
         interrupt_at_checkpoint(patched, checkpoint)
         with pytest.raises(KeyboardInterrupt):
             declare().train(path, seed=3, quiet=True, evolve=evolve)

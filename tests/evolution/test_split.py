@@ -21,8 +21,8 @@ from skillweave import DQN, PPO, RNN, Agent, EnvSpec, Network, Ray, SkillweaveEr
 from skillweave._internal.seeding import Seeds
 from skillweave.errors import DeclarationError
 from skillweave.evolution import Evolution, Mutations
-from skillweave.evolution.part import FitnessEnvs
 from skillweave.evolution.population import Population
+from skillweave.evolution.shard import FitnessEnvs
 from skillweave.evolution.split import Parts
 from skillweave.training.learning_task import skill_task
 from skillweave.training.role import agent_role

@@ -36,10 +36,10 @@ from skillweave.evolution import (
     Range,
     Tournament,
     Truncation,
-    stage as evolving,
+    generations as evolving,
 )
-from skillweave.evolution.part import FitnessEnvs, Part, has_diverged
 from skillweave.evolution.population import Population
+from skillweave.evolution.shard import FitnessEnvs, Shard, has_diverged
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.training.learning_task import skill_task
 from skillweave.training.role import agent_role
@@ -215,15 +215,15 @@ def test_a_killed_population_of_selectors_ends_with_the_very_same_weights(
     )
     evolve = {"selector": Evolution(3, 4, 2, mutations=EVERYTHING)}
     whole = hierarchy.train(tmp_path / "whole", quiet=True, evolve=evolve)
-    state, cuts = Part.state, [0]
+    state, cuts = Shard.state, [0]
 
-    def dies(self: Part) -> Any:
+    def dies(self: Shard) -> Any:
         cuts[0] += 1
         if cuts[0] == 3:  # goes on from the second
             raise KeyboardInterrupt
         return state(self)
 
-    monkeypatch.setattr(Part, "state", dies)
+    monkeypatch.setattr(Shard, "state", dies)
     with pytest.raises(KeyboardInterrupt):
         hierarchy.train(tmp_path / "run", quiet=True, evolve=evolve)
     monkeypatch.undo()

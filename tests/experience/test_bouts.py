@@ -8,7 +8,7 @@ import pytest
 
 from skillweave import DQN, SAC, TD3, Network
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.experience.acting import Acting, ActionRepeat, Request
 from skillweave.training.learner import Stack
 from skillweave.training.replay_learner import learner_of

@@ -11,8 +11,8 @@ from toys import calling_in, skills_of
 from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import make_engine
 from skillweave.experience.acting import Acted
-from skillweave.experience.calls import SMOOTHED, as_logits
 from skillweave.experience.collector import joined_collected
+from skillweave.experience.decisions import SMOOTHED, as_logits
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.skills import Automaton
 

@@ -179,8 +179,8 @@ def test_a_critic_is_told_where_calls_begin(margin):
 
 
 def test_a_learner_of_the_library_acts_and_its_head_is_kept():
+    from skillweave.algorithms.agent_policy import make_algorithm
     from skillweave.algorithms.config import PPO
-    from skillweave.algorithms.policy import make_algorithm
 
     env, n = Walk(), N
     algorithm = make_algorithm(PPO(), env.observation_space, env.action_space)

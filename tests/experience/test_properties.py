@@ -11,9 +11,9 @@ from toy_acting import Choices, requests, valid_rows
 from toys import ASKS, SHOWS, alone_in, calling_in, skills_of
 
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.batches import Batch
 from skillweave.algorithms.config import PPO, SAC
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.envs.joined import JoinedEngines
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.experience.acting import Acting, Request

@@ -163,7 +163,7 @@ def test_an_episode_that_ends_early_when_it_is_played_again_begins_anew(monkeypa
 def test_an_episode_that_nothing_ends_is_truncated_wherever_checkpoints_are_written(
     saves, monkeypatch
 ):
-    monkeypatch.setattr("skillweave.envs.checks.LONGEST_EPISODE", 10)
+    monkeypatch.setattr("skillweave.envs.checked.LONGEST_EPISODE", 10)
     env, truncated = given(Moody, 2), []
     for at in range(25):
         rows = step(env, [0, 0]).batches[""]
@@ -176,7 +176,7 @@ def test_an_episode_that_nothing_ends_is_truncated_wherever_checkpoints_are_writ
 
 
 def test_the_steps_of_an_open_episode_count_on_after_a_resume(monkeypatch):
-    monkeypatch.setattr("skillweave.envs.checks.LONGEST_EPISODE", 10)
+    monkeypatch.setattr("skillweave.envs.checked.LONGEST_EPISODE", 10)
     first, again = given(Moody, 2), given(Moody, 2)
     for _ in range(6):
         step(first, [0, 0])
@@ -190,7 +190,7 @@ def test_a_state_changes_nothing(kind, monkeypatch):
     if kind == "EnvPool":
         pytest.importorskip("envpool")
     monkeypatch.setattr("skillweave.envs.envpool_engine.RENEW_AFTER", 30)
-    monkeypatch.setattr("skillweave.envs.checks.LONGEST_EPISODE", 17)
+    monkeypatch.setattr("skillweave.envs.checked.LONGEST_EPISODE", 17)
     saving, other, asked = KINDS[kind](), KINDS[kind](), requests(5)
     for collector in (saving, other):
         collector.start(Seeds(5))

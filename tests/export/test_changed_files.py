@@ -22,7 +22,7 @@ pytest.importorskip("onnxscript")
 _ = traced_once  # of all tests here, too
 ODD: list[Any] = [
     None, True, -1, 0, 1, 10**9, 2**63, -0.5, 1e308, "", "x", "../x", [], [[]], [0, 0], {},
-    {"type": "Hierarchy"}, {"type": "Step"}, {"file": "free.onnx"}, {"code": "x"},
+    {"type": "CallAndReturn"}, {"type": "Step"}, {"file": "free.onnx"}, {"code": "x"},
     {"array": [1e9], "dtype": "float32"}, {"array": 1, "dtype": "V8"}, {"stored": "x"},
     {"float": "nan"}, {"float": "inf"},
 ]  # fmt: skip

@@ -39,7 +39,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 FREE = {"file": "free.onnx"}
-STATE = {"type": "Automaton", "who": "it", "skills": ["free", "remembers"], "goals": {}}
+STATE = {"type": "StateMachine", "who": "it", "skills": ["free", "remembers"], "goals": {}}
 REVERSED = ["remembers", "free"]
 ONE = {"states": {"a": ["free"]}, "transitions": [], "first": "a"}
 WRONG: list[tuple[str, Any]] = [
@@ -53,7 +53,7 @@ WRONG: list[tuple[str, Any]] = [
     ("policy.skills[1].name", "free"),
     ("policy.interruption.worth.policy.file.file", "free.onnx"),
     ("policy.interruption.margin", None),
-    ("policy.selector.type", "Hierarchy"),
+    ("policy.selector.type", "CallAndReturn"),
     ("policy.selector.file.file", "free.onnx"),
     ("policy.selector", STATE | {"states": {"a": ["fre"]}, "transitions": [], "first": "a"}),
     ("policy.selector", STATE | {"states": {"a": ["free"]}, "transitions": [], "first": "b"}),

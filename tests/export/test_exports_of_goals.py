@@ -15,8 +15,8 @@ from playing import alike, loaded_of, runner_of
 from test_networks import agent
 
 import skillweave as sw
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.config import SkillCritic
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.player import Player
 from skillweave.errors import RunError, SkillError
 from skillweave.export.runner import Runner

@@ -17,8 +17,8 @@ from toys import ASKS, SHOWS
 
 from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network, SkillweaveError
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.config import AlgorithmConfig
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api.player import Player
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner

@@ -13,10 +13,10 @@ from worlds import OFTEN, SELECTOR, SMALL, SPACES, Point, Rest, declared, go_to
 
 import skillweave as sw
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.config import SkillCritic
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.policies.core import INTERRUPTED, RUNNING, Policy
-from skillweave.policies.hierarchy import CalledSkill, Hierarchy, Interruption
+from skillweave.policies.core import INTERRUPTED, RUNNING, RowPolicy
+from skillweave.policies.hierarchy import CallAndReturn, CalledSkill, Interruption
 from skillweave.skills.goal_spaces import draw_from, with_goal
 from skillweave.skills.goals import goals_of
 from skillweave.skills.skill_set import SkillSet
@@ -37,11 +37,11 @@ def random_critic(space, goals: dict[str, Any], **how) -> AgentPolicy:
     return AgentPolicy(algorithm, weights)
 
 
-def of_skills(goals: dict[int, Any]) -> Hierarchy:
+def of_skills(goals: dict[int, Any]) -> CallAndReturn:
     skills = (
-        CalledSkill(of.skill.name, of.skill.name, Policy(), goals=of) for of in goals.values()
+        CalledSkill(of.skill.name, of.skill.name, RowPolicy(), goals=of) for of in goals.values()
     )
-    return Hierarchy(None, tuple(skills))
+    return CallAndReturn(None, tuple(skills))
 
 
 @pytest.mark.parametrize("space", ["box", "number", "dict", "picture"])

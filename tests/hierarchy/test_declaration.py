@@ -24,7 +24,7 @@ from skillweave import (
     SkillweaveError,
     recipes,
 )
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.api import Run
 from skillweave.cli.overrides import apply_overrides, list_settings
 from skillweave.errors import DeclarationError

@@ -14,7 +14,7 @@ from toys import cartpole, network_of, skills_of
 
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillError, SkillweaveError
-from skillweave.hierarchy.options import OptionsEnv
+from skillweave.hierarchy.options_env import OptionsEnv
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.skills.skill_set import SkillSet
@@ -57,7 +57,7 @@ def walks():
 
 
 def test_a_call_that_nothing_ends_is_told_and_not_waited_for(options, monkeypatch):
-    monkeypatch.setattr("skillweave.hierarchy.options.LONGEST_EPISODE", 2)
+    monkeypatch.setattr("skillweave.hierarchy.options_env.LONGEST_EPISODE", 2)
 
     class Eternal(Left):
         max_steps = None

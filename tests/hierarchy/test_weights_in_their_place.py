@@ -10,9 +10,9 @@ import torch
 from declaring import plainly
 
 from skillweave import PPO, Hierarchy, Network, Skill, SkillweaveError
-from skillweave.algorithms.policy import state_from
+from skillweave.algorithms.agent_policy import state_from
 from skillweave.cli import main
-from skillweave.compat.agilerl import agents as agilerl
+from skillweave.compat.agilerl import agent_classes as agilerl
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
 
 SMALL = PPO(num_envs=2, n_steps=8, batch_size=16, network=Network((4,)), overlap=False)

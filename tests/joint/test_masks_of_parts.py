@@ -13,8 +13,8 @@ from small_runs import goes_on, reports_every
 from torch.distributions import Categorical, Normal
 
 import skillweave as sw
-from skillweave.envs.checks import CheckedEnv
-from skillweave.envs.infos import random_actions
+from skillweave.envs.checked import CheckedEnv
+from skillweave.envs.env_infos import random_actions
 from skillweave.errors import DeclarationError, EnvError, SkillError
 from skillweave.networks.heads import head_of
 from skillweave.policies.spaces import space_of

@@ -8,7 +8,7 @@ import torch
 from skillweave import PPO, Network
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import register_encoder
-from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.errors import DeclarationError
 from skillweave.networks.encoders import (
     CELL_FEATURES,

@@ -11,8 +11,8 @@ from torch.nn import functional as F
 from toys import Echo, drawn, learn
 
 from skillweave.algorithms import register_encoder
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.config import DQN, PPO
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.networks import encoders
 from skillweave.networks.config import CNN, Network

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from toys import drawn
 
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.config import (
     DQN,
     PPO,
@@ -20,7 +21,6 @@ from skillweave.algorithms.config import (
     config_from_json,
     config_to_json,
 )
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError
 from skillweave.networks.config import CNN, RNN, Network

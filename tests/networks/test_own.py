@@ -26,8 +26,8 @@ from skillweave import DQN, PPO, RNN, SAC, TD3, Hierarchy, Network, SkillweaveEr
 from skillweave._internal import named as naming
 from skillweave._internal.named import Named, named
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.config import config_from_json, config_to_json
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution import Evolution, Mutations
 from skillweave.networks.encoders import make_encoder
@@ -283,7 +283,7 @@ def test_it_is_known_where_its_settings_are_unpacked(tmp_path):
     )
     code = (
         "from skillweave.workers.shipping import unpacked\n"
-        "from skillweave.algorithms.policy import AgentPolicy\n"
+        "from skillweave.algorithms.agent_policy import AgentPolicy\n"
         f"policy, file, obs, want = unpacked(open({str(tmp_path / 'sent')!r}, 'rb').read())\n"
         "again = AgentPolicy.from_file(*file, 'it')\n"
         "print([(p.act({}, obs)[0] == want).all() for p in (policy, again)])\n"

@@ -15,7 +15,7 @@ from playing import alike, episode, loaded_of, runner_of
 from torch import nn
 
 import skillweave as sw
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.errors import SkillError
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy

@@ -8,10 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from skillweave.policies.core import Policy
-from skillweave.policies.errors import PolicyError
+from skillweave.policies.acting_errors import PolicyError
+from skillweave.policies.core import RowPolicy
 from skillweave.policies.mapped import Input, Take
-from skillweave.policies.parts import Part, PartOf
+from skillweave.policies.parts import PartOf, Slice
 from skillweave.policies.spaces import Space, space_of
 
 
@@ -29,20 +29,20 @@ HELD = ((), np.ones(3, bool))
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: Part(BOX, box(1), places=(3,), fixed=FIXED), r"Part.places is \(3,\).* 0 to 2"),
-        (lambda: Part(BOX, box(2), places=(0,), fixed=FIXED), "Part.own is "),
-        (lambda: Part(BOX, box(1), places=(0,)), "Part.fixed is None"),
-        (lambda: Part(BOX, box(1), places=(0,), fixed=FIXED[0]), "Part.fixed is .*does not fit"),
+        (lambda: Slice(BOX, box(1), places=(3,), fixed=FIXED), r"Part.places is \(3,\).* 0 to 2"),
+        (lambda: Slice(BOX, box(2), places=(0,), fixed=FIXED), "Part.own is "),
+        (lambda: Slice(BOX, box(1), places=(0,)), "Part.fixed is None"),
+        (lambda: Slice(BOX, box(1), places=(0,), fixed=FIXED[0]), "Part.fixed is .*does not fit"),
         (
-            lambda: Part(BOX, box(1), places=(0,), fixed=FIXED, held=((("x",), HELD[1]),)),
+            lambda: Slice(BOX, box(1), places=(0,), fixed=FIXED, held=((("x",), HELD[1]),)),
             r"Part.held has \('x',\)",
         ),
         (
-            lambda: Part(BOTH, ONE, paths=((("arm",), ()),), fixed=BOTH.start(1)),
+            lambda: Slice(BOTH, ONE, paths=((("arm",), ()),), fixed=BOTH.start(1)),
             r"Part.paths has \('arm',\) and \(\), which are not alike",
         ),
-        (lambda: Part(BOX, BOX, SEES), "Part.inputs and Part.sees must be given together"),
-        (lambda: Part(BOX, BOX, SEES, box(3)), "Part.sees is .*does not fit Part.inputs"),
+        (lambda: Slice(BOX, BOX, SEES), "Part.inputs and Part.sees must be given together"),
+        (lambda: Slice(BOX, BOX, SEES, box(3)), "Part.sees is .*does not fit Part.inputs"),
     ],
 )
 def test_what_contradicts_itself_is_refused(make: Any, says: str) -> None:
@@ -51,8 +51,8 @@ def test_what_contradicts_itself_is_refused(make: Any, says: str) -> None:
 
 
 def test_what_does_not_fit_the_spaces_is_refused() -> None:
-    part = Part(BOX, box(1), SEES, box(4), 1, (0,), fixed=FIXED, held=(HELD,))
-    whole = PartOf(Policy(), part)
+    part = Slice(BOX, box(1), SEES, box(4), 1, (0,), fixed=FIXED, held=(HELD,))
+    whole = PartOf(RowPolicy(), part)
     whole.check(box(4), BOX, None, "policy")
     for sees, acts, says in (
         (box(5), BOX, r"policy.part.inputs\[''\] takes the observation of shape \(4,\)"),

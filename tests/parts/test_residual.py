@@ -13,7 +13,7 @@ from small_runs import reports_every
 from torch import nn
 
 import skillweave as sw
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.errors import DeclarationError
 from skillweave.evolution import Evolution
 

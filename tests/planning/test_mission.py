@@ -21,7 +21,7 @@ from skillweave.planning import (
     in_any_order,
     reached,
 )
-from skillweave.recipes._missions import HALF, KINDS, POINTS, Progress
+from skillweave.recipes._missions import HALF, KINDS, POINTS, MissionState
 
 P = [Predicate(column(i)) for i in range(4)]
 NAMES = {"abcd"[i]: p for i, p in enumerate(P)}
@@ -158,7 +158,7 @@ def test_it_pays_as_the_landers_missions_do():
         by_name = {"left": left, "right": right, "hover": held(hover, 100)}
         task = Mission(*(by_name[n] for n in names))
         n, rng = 8, np.random.default_rng(1)
-        progress, ids = Progress(n, [names], gusts=False), np.arange(n)
+        progress, ids = MissionState(n, [names], gusts=False), np.arange(n)
         progress.begin(ids, [rng] * n)
         state, place = task.start(n), np.zeros((n, 8))
         goal = np.zeros((n, 2))

@@ -8,9 +8,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from skillweave.policies.acting_errors import PolicyError, SkillError
 from skillweave.policies.core import LIMIT, OWN, RUNNING, LastCall, Turn, World
-from skillweave.policies.errors import PolicyError, SkillError
-from skillweave.policies.selectors import Asked, Automaton, Branch, Check, Leaf, Rule, Tree
+from skillweave.policies.selectors import (
+    Asked,
+    Branch,
+    Leaf,
+    Rule,
+    StateMachine,
+    Tree,
+    TreeCondition,
+)
 from skillweave.policies.spaces import Space
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.spaces import obs_dtype
@@ -33,7 +41,7 @@ def asked(skills: Any = ABC, goals: Any = None) -> Rule:
 
 
 def automaton(states: Any, arrows: Any = (), start: str = "x", goals: Any = ()) -> Rule:
-    return Automaton("it", ABC, {"a": NEAR}, states, start, arrows, goals)
+    return StateMachine("it", ABC, {"a": NEAR}, states, start, arrows, goals)
 
 
 def tree(root: Any) -> Rule:
@@ -59,7 +67,7 @@ WRONG = {
     "a goal of no state": (lambda: automaton(X, goals=(("y", "a", HERE),)), "the state 'y'"),
     "a goal without goals": (lambda: automaton(X, goals=(("x", "b", HERE),)), "which has no goals"),
     "another goal": (lambda: automaton(X, goals=(("x", "a", HERE[:1]),)), r"'a' has shape \(1,\)"),
-    "a tree without a skill": (lambda: tree(Check("flag", flag)), "has no skill"),
+    "a tree without a skill": (lambda: tree(TreeCondition("flag", flag)), "has no skill"),
     "a leaf": (lambda: tree(Leaf("d")), "a leaf names 'd', which is no skill"),
     "a leaf's goal": (lambda: tree(Leaf("b", HERE)), "'b', which has no goals"),
     "no children": (lambda: tree(Branch("Sequence", ())), "a Sequence of 0 children"),
@@ -80,7 +88,7 @@ def turn(mask: Any = None) -> Turn:
 
 
 def test_a_tree_acts_in_some_of_the_environments_by_hand() -> None:
-    fallback = Branch("Fallback", (Check("flag", flag), Leaf("a", HERE)))
+    fallback = Branch("Fallback", (TreeCondition("flag", flag), Leaf("a", HERE)))
     rule = tree(Branch("Sequence", (fallback, Leaf("b"), Leaf("c"))))
     memory, rows = rule.start(4), np.array([3, 1])
     # In environment 3 the flag is set, so b is called; in environment 1 it is not, so a is.

@@ -26,7 +26,7 @@ def lander(place, speed=(0.0, 0.0), legs=(0.0, 0.0)):
 
 def fly(mission, places, rested=False):
     """What is paid in each step, and the progress after all; it may rest in the last step."""
-    progress = world.Progress(1, [mission], gusts=False)
+    progress = world.MissionState(1, [mission], gusts=False)
     progress.begin(ONE, [np.random.default_rng(0)])
     paid = []
     for i, place in enumerate(places):
@@ -79,11 +79,11 @@ def test_what_is_still_to_be_done_stands_in_the_observation():
 @pytest.mark.parametrize("legs", [(), ("left",) * 4, ("left", "up")])
 def test_missions_that_there_are_not_are_refused(legs):
     with pytest.raises(DeclarationError, match="a mission has 1 to 3 legs of left, right, hover"):
-        world.Progress(1, [legs], gusts=False)
+        world.MissionState(1, [legs], gusts=False)
 
 
 def test_gusts_fire_the_engines_of_alternating_sides():
-    progress = world.Progress(1, [("land",)], gusts=True)
+    progress = world.MissionState(1, [("land",)], gusts=True)
     progress.begin(ONE, [np.random.default_rng(0)])
     progress._time[:] = 0
     fired = []
@@ -120,7 +120,7 @@ def test_a_pool_and_single_landers_are_the_same_for_the_same_flights():
     n, legs, rng = 6, missions.MISSIONS["any"], np.random.default_rng(1)
     pool = world.MissionPool(SideBySide([Film(i) for i in range(n)]), legs, True, n, seed=0)
     pool._rngs = [np.random.default_rng(100 + i) for i in range(n)]
-    alone = [world.Mission(Film(i), legs, gusts=True) for i in range(n)]
+    alone = [world.MissionTask(Film(i), legs, gusts=True) for i in range(n)]
     obs, _ = pool.reset(np.arange(n))
     mine = [env.reset(seed=100 + i)[0] for i, env in enumerate(alone)]
     np.testing.assert_array_equal(obs, mine)
@@ -281,7 +281,7 @@ def test_skills_sample_and_a_selector_over_given_skills_takes_fewer_steps():
 
 
 def test_the_selector_by_hand_calls_the_skill_of_the_leg():
-    progress = world.Progress(4, [(kind,) for kind in world.KINDS], gusts=False)
+    progress = world.MissionState(4, [(kind,) for kind in world.KINDS], gusts=False)
     progress.left[:, 0] = np.arange(4)
     obs = progress.seen(np.stack([lander(SKY)] * 4), np.arange(4))
     assert missions.by_leg(obs).tolist() == ["go_left", "go_right", "hover", "land"]
@@ -291,7 +291,7 @@ def test_the_selector_by_hand_chooses_a_skill_that_may_start_on_any_mission():
     every = [m for n in (1, 2, 3) for m in itertools.product(world.KINDS, repeat=n)]
     skills = {skill().name: skill() for skill in missions.SKILLS}
     for mission in every:
-        progress = world.Progress(1, [mission], gusts=False)
+        progress = world.MissionState(1, [mission], gusts=False)
         progress.begin(ONE, [np.random.default_rng(0)])
         for done in range(len(mission) + 1):
             progress.left[0] = [*progress.left[0, 1:], -1] if done else progress.left[0]
@@ -346,7 +346,7 @@ def test_any_mission_is_flown_by_hand(mission, tmp_path):
         "land": glides(0.0, 2),
     }  # fmt: skip
     found = missions.with_skills("tour", policies, selector=missions.by_leg)
-    found.env = EnvSpec(lambda: world.Mission(Glider(), [mission]))
+    found.env = EnvSpec(lambda: world.MissionTask(Glider(), [mission]))
     score = found.train(tmp_path / "run", quiet=True).evaluate(3, quiet=True)
     assert score.success_rate == 1.0
     assert score.mean == pytest.approx(1.0)

@@ -15,7 +15,7 @@ from skillweave import EnvSpec, SkillweaveError
 from skillweave.cli import main
 from skillweave.errors import EnvError
 from skillweave.reporting.palette import hex_of, is_light
-from skillweave.reporting.report import calls
+from skillweave.reporting.report import timelines
 from skillweave.reporting.report.charts import scores
 from skillweave.reporting.report.curves import read_curves, thinned
 from skillweave.reporting.report.facts import transition_rows, transitions
@@ -50,12 +50,12 @@ def test_calls_by_hand(tmp_path):
 
 def test_many_calls_are_shown_in_part(tmp_path, monkeypatch):
     log = played(tmp_path / "run", 3)
-    shown, missing = calls.episode_data(log, None)
+    shown, missing = timelines.episode_data(log, None)
     assert ([e["number"] for e in shown], missing) == ([1, 2, 3], [])
     assert told(shown[0]["calls"]) == CALLS
-    monkeypatch.setattr(calls, "MOST_CALLS", 5)
-    monkeypatch.setattr(calls, "MOST_CALLS_OF_ONE", 3)
-    shown, missing = calls.episode_data(log, None)
+    monkeypatch.setattr(timelines, "MOST_CALLS", 5)
+    monkeypatch.setattr(timelines, "MOST_CALLS_OF_ONE", 3)
+    shown, missing = timelines.episode_data(log, None)
     assert [told(e["calls"]) for e in shown] == [CALLS[:3]]
     assert missing == [
         "Of the 4 calls of episode 1, 3 are shown.",
@@ -64,20 +64,20 @@ def test_many_calls_are_shown_in_part(tmp_path, monkeypatch):
 
 
 def test_decisions_are_coordinates_and_calls(tmp_path):
-    found = calls.decision_data(played(tmp_path / "run"))
+    found = timelines.decision_data(played(tmp_path / "run"))
     assert found["names"] == ["obs[0]", "obs[1]", "step of the episode"]
     assert found["rows"] == [[0, 0, 0], [2, 2, 2], [2, 5, 5], [4, 7, 7]]
     assert told(found["calls"]) == CALLS
 
 
 def test_coordinates_of_unlike_observations():
-    assert list(calls.coordinates(np.zeros(3, np.int64))) == ["obs"]
-    assert list(calls.coordinates(np.zeros((3, 2, 2)))) == [f"obs[{i}]" for i in range(4)]
-    assert calls.coordinates(np.zeros((3, 84, 84, 3), np.uint8)) == {}
+    assert list(timelines.coordinates(np.zeros(3, np.int64))) == ["obs"]
+    assert list(timelines.coordinates(np.zeros((3, 2, 2)))) == [f"obs[{i}]" for i in range(4)]
+    assert timelines.coordinates(np.zeros((3, 84, 84, 3), np.uint8)) == {}
     parts = np.zeros(3, [("place", "f4", (2,)), ("camera", "u1", (64, 64)), ("key", "i8")])
     names = ['obs["place"][0]', 'obs["place"][1]', 'obs["key"]']
-    assert list(calls.coordinates(parts)) == names
-    assert calls.coordinates(np.array([[np.inf], [0.0]])) == {}
+    assert list(timelines.coordinates(parts)) == names
+    assert timelines.coordinates(np.array([[np.inf], [0.0]])) == {}
 
 
 def test_filmed_are_the_worst_the_median_and_the_best():
@@ -85,9 +85,9 @@ def test_filmed_are_the_worst_the_median_and_the_best():
         Episode(i, np.zeros(1), np.array([r]), np.zeros(0))
         for i, r in enumerate([5.0, 1.0, 9.0, 3.0, 7.0])
     ]
-    assert calls.chosen_episodes(episodes, 3) == [1, 0, 2]
-    assert calls.chosen_episodes(episodes, 1) == [1]
-    assert sorted(calls.chosen_episodes(episodes, 9)) == [0, 1, 2, 3, 4]
+    assert timelines.chosen_episodes(episodes, 3) == [1, 0, 2]
+    assert timelines.chosen_episodes(episodes, 1) == [1]
+    assert sorted(timelines.chosen_episodes(episodes, 9)) == [0, 1, 2, 3, 4]
 
 
 def test_a_film_says_where_each_episode_begins(tmp_path):

@@ -13,9 +13,9 @@ from reporting.walkway import Walkway, declare
 
 from skillweave import EnvSpec
 from skillweave.planning import CallLog
-from skillweave.reporting.report import film, handover
+from skillweave.reporting.report import film, matrix as page
 from skillweave.reporting.report.film import HOLD
-from skillweave.reporting.report.handover import add_handover
+from skillweave.reporting.report.matrix import add_handover
 from skillweave.reporting.report.page import Page
 from skillweave.runs.directory import CALLS
 
@@ -96,9 +96,9 @@ def test_calls_are_played_again_as_they_were(log, monkeypatch):
 
 
 def test_only_calls_whose_episodes_are_whole_are_played_again(log):
-    assert handover._playable(log).all()
+    assert page._playable(log).all()
     without_first = log.take(np.flatnonzero((log.order > 0) | (log.episode > 0)))
-    playable = handover._playable(without_first)
+    playable = page._playable(without_first)
     assert (playable == (without_first.episode > 0)).all()
     unknown = replace(log, seed=np.full(len(log), -1))
     made = section(unknown)
@@ -125,9 +125,9 @@ def test_a_log_from_elsewhere_may_hold_anything(log):
 
 
 def test_few_points_and_a_short_film_of_many_calls(log, monkeypatch):
-    monkeypatch.setattr(handover, "MOST_POINTS", 60)
-    monkeypatch.setattr(handover, "MOST_FILMED", 6)
-    monkeypatch.setattr(handover, "MOST_FRAMES", 4)
+    monkeypatch.setattr(page, "MOST_POINTS", 60)
+    monkeypatch.setattr(page, "MOST_FILMED", 6)
+    monkeypatch.setattr(page, "MOST_FRAMES", 4)
     data = section(log).data["handover"]
     assert max(map(len, data["points"].values())) <= 60 // len(data["points"]) + 1
     assert sum(len(cell["clips"]) for cell in data["cells"].values()) in (1, 2, 3)

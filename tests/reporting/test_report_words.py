@@ -14,7 +14,7 @@ from small_runs import stage_entry
 
 from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
 from skillweave.errors import DeclarationError
-from skillweave.reporting.report import calls
+from skillweave.reporting.report import timelines
 from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.facts import about, no_verdict, number, percent, verdict
 from skillweave.reporting.report.single import score_words
@@ -221,25 +221,25 @@ def test_docstrings_are_those_of_the_user():
 
 def test_named_observations_name_axes_and_what_each_call_saw(tmp_path):
     log, names = played(tmp_path / "run"), ["metre", "time"]
-    assert calls.decision_data(log, names)["names"] == [*names, "step of the episode"]
-    (shown,), _ = calls.episode_data(log, None, names)
+    assert timelines.decision_data(log, names)["names"] == [*names, "step of the episode"]
+    (shown,), _ = timelines.episode_data(log, None, names)
     assert shown["seen"] == [[0, 0], [2, 2], [2, 5], [4, 7]]
-    assert list(calls.seen(log.episodes[0].calls, names)) == names
-    (shown,), _ = calls.episode_data(log, None)
+    assert list(timelines.seen(log.episodes[0].calls, names)) == names
+    (shown,), _ = timelines.episode_data(log, None)
     assert "seen" not in shown
     assert told(shown["calls"]) == CALLS
 
 
 def test_names_that_do_not_fit_are_said_and_not_used(tmp_path):
     obs = np.zeros((3, 2))
-    assert calls.names_misfit(obs, ["a", "b"]) is None
-    says = calls.names_misfit(obs, ["a"])
+    assert timelines.names_misfit(obs, ["a", "b"]) is None
+    says = timelines.names_misfit(obs, ["a"])
     assert says == "obs_names is not used: it has 1 names, and an observation 2 numbers."
-    assert "no Dict" in str(calls.names_misfit(obs, {"a": ["b", "c"]}))
+    assert "no Dict" in str(timelines.names_misfit(obs, {"a": ["b", "c"]}))
     parts = np.zeros(3, [("place", "f4", (2,)), ("key", "i8")])
-    assert calls.names_misfit(parts, {"place": ["x", "y"], "key": ["has key"]}) is None
-    assert "no such key" in str(calls.names_misfit(parts, {"plaec": ["x", "y"]}))
-    found = calls.coordinates(parts, {"place": ["x", "y"]})
+    assert timelines.names_misfit(parts, {"place": ["x", "y"], "key": ["has key"]}) is None
+    assert "no such key" in str(timelines.names_misfit(parts, {"plaec": ["x", "y"]}))
+    found = timelines.coordinates(parts, {"place": ["x", "y"]})
     assert list(found) == ["x", "y", 'obs["key"]']
 
 

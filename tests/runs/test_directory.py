@@ -20,8 +20,8 @@ from small_runs import level_entry, small_manifest
 from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy, make_algorithm, state_from
 from skillweave.algorithms.config import PPO, config_to_json
-from skillweave.algorithms.policy import AgentHeader, AgentPolicy, make_algorithm, state_from
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory

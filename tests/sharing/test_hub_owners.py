@@ -10,7 +10,7 @@ import pytest
 from shared_runs import NAME, files_of, same_actions
 
 import skillweave as sw
-from skillweave.api import hub as sharing
+from skillweave.api import push_pull as sharing
 from skillweave.cli import main
 from skillweave.errors import SkillweaveError
 from skillweave.reporting.plots import plot_run

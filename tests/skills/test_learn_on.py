@@ -8,7 +8,7 @@ from small_runs import interrupted
 
 import skillweave as sw
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.errors import DeclarationError, PolicyError, RunError
 
 sb3 = pytest.importorskip("stable_baselines3")

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from skills.mapped_models import onnx_model, weights
 
+from skillweave.policies.acting_errors import PolicyError
 from skillweave.policies.core import Memory, Turn, World
-from skillweave.policies.errors import PolicyError
 from skillweave.policies.mapped import (
+    Affine,
     Function,
     Input,
-    Linear,
     Mapped,
     OnnxFile,
     Outputs,
@@ -53,7 +53,7 @@ BOTH = Space("Dict", parts={"a": box(2), "b": choice(2)})
         (lambda: Take("goal", (2,), low=np.zeros(3)), r"Take.low has the shape \(3,\)"),
         (lambda: Take("last_action", (2, 2)), r"Take.shape is \(2, 2\)"),
         (lambda: Input((SEEN,), (4,)), r"Input.shape is \(4,\), but Input.takes gives 3"),
-        (lambda: Input((SEEN,), (3,), (Linear(np.zeros(2)),)), "Linear.offset has the shape"),
+        (lambda: Input((SEEN,), (3,), (Affine(np.zeros(2)),)), "Linear.offset has the shape"),
         (lambda: Outputs(box(3), (0, 0), rest=np.zeros(3)), "Outputs.to is .*each one once"),
         (lambda: Outputs(box(3), (0,)), "Outputs.rest must give"),
         (lambda: Outputs(box(3), (0,), rest=np.zeros(2)), "Outputs.rest has the shape"),
@@ -153,7 +153,7 @@ def recurrent(chunk: int | None) -> Mapped:
         return (outputs if chunk else outputs[:, 0]), after
 
     takes = SEEN, Take("last_action", (2,)), Take("goal", (2,), low=np.array(-0.5))
-    inputs = {"": Input(takes, (7,), (Linear(np.full(7, 0.1), np.full(7, 0.5)),))}
+    inputs = {"": Input(takes, (7,), (Affine(np.full(7, 0.1), np.full(7, 0.5)),))}
     outputs = Outputs(box(3), (2, 0), np.full(2, 0.5), clip=(-0.75, 0.75), rest=np.full(3, 0.25))
     function = Function(model, ((2, None),), single_state=True)
     return Mapped(function, outputs, inputs, 2, chunk, np.array([0.25, -1.0]), box(2))

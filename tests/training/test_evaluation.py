@@ -12,8 +12,8 @@ from gymnasium.spaces import Box, Discrete
 from toys import network_of
 
 from skillweave import EnvSpec, Skill, SkillweaveError, envpool, evaluate
-from skillweave.algorithms.policy import AgentPolicy
-from skillweave.envs import checks
+from skillweave.algorithms.agent_policy import AgentPolicy
+from skillweave.envs import checked
 from skillweave.errors import PolicyError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.skills.scripted import ScriptedPolicy
@@ -346,7 +346,7 @@ def test_only_those_that_nothing_has_ended_count_as_cut():
 
 
 def test_without_a_limit_the_environments_own_counts_or_the_longest_episode(monkeypatch):
-    monkeypatch.setattr(checks, "LONG_EPISODE", 9)
+    monkeypatch.setattr(checked, "LONG_EPISODE", 9)
     assert evaluate(fixed(1), EnvSpec(Endless), episodes=1).lengths == (9,)
     limited = EnvSpec(lambda: gym.wrappers.TimeLimit(Endless(), 12))
     found = evaluate(fixed(1), limited, episodes=1)

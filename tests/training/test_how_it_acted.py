@@ -9,9 +9,9 @@ import torch
 
 from skillweave import Together
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.batches import Batch
 from skillweave.algorithms.config import SkillCritic
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.training.joint import JointLearner, how_it_acted
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.types import Array

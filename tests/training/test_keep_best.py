@@ -35,7 +35,7 @@ from skillweave import (
     train_agent,
 )
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.evolution import Evolution
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory

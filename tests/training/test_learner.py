@@ -19,16 +19,16 @@ from toys import (
 
 from skillweave._internal.prefixes import unprefixed
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import DQN, SAC, TD3
 from skillweave.algorithms.dqn import DQNAlgorithm
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.errors import SkillweaveError
 from skillweave.experience.acting import Acting
 from skillweave.experience.group import Collectors
 from skillweave.networks.config import Network
 from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack, crossed
-from skillweave.training.loop import Loop, Progress
+from skillweave.training.loop import Loop, LoopState
 from skillweave.training.replay_learner import ReplayLearner, store_of
 
 SETTINGS = {
@@ -218,7 +218,7 @@ def test_where_environments_begin_anew_trajectories_and_returns_end():
     found.learner.cut(np.array([1, 3]))
     assert found.learner.counts()["returns"].tolist() == [1.5, 0.0, 1.5, 0.0]
     found.collectors.parts[0]._begin_anew(np.array([1, 3]))
-    found.run(4 * 4, at=Progress(2, 8))
+    found.run(4 * 4, at=LoopState(2, 8))
     drawn = found.learner.store.sample(500, found.state.gamma, [np.random.default_rng(0)])
     after = {(int(o), int(n)) for o, n in zip(drawn.obs[0], drawn.next_obs[0], strict=True)}
     assert after == {(0, 2), (1, 3), (2, 4), (3, 4), (1, 2)}
@@ -231,7 +231,7 @@ def test_a_resumed_run_without_its_store_fills_it_by_what_it_has_learnt():
     env = Identity(4)
     spy = Spy(replace(CONFIG, save_buffer=False), env.observation_space, env.action_space)
     found = training(spy, env, goes_on_at=200)
-    found.run(400, at=Progress(50, 200))
+    found.run(400, at=LoopState(50, 200))
     assert "random" not in spy.log
     assert spy.log[:11] == ["act"] * 11  # until there are more than 40 transitions again
     assert spy.log[11:16] == ["learn"] * 4 + ["act"]

@@ -36,7 +36,7 @@ from skillweave import (
 )
 from skillweave.cli import main
 from skillweave.envs.engine import GymnasiumEngine
-from skillweave.envs.infos import info_numbers
+from skillweave.envs.env_infos import info_numbers
 from skillweave.errors import EnvError
 from skillweave.evolution import Evolution
 from skillweave.hierarchy import training

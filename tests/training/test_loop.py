@@ -23,8 +23,8 @@ from toys import (
 )
 
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import DQN, PPO, SAC, TD3
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError, TrainingError
@@ -34,7 +34,7 @@ from skillweave.networks.config import RNN, Network
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack
 from skillweave.training.learning_task import skill_task
-from skillweave.training.loop import Progress
+from skillweave.training.loop import LoopState
 from skillweave.training.replay_learner import learner_of
 from skillweave.training.role import agent_role
 from skillweave.workers.placement import make_collectors
@@ -194,7 +194,7 @@ def test_training_ends_within_one_rollout_of_its_budget(config, env, budget):
 def test_a_budget_that_is_spent_already_changes_nothing():
     found = made(Identity(16))
     before = found.state.params.clone()
-    assert found.run(256, at=Progress(1, 256)) == Progress(1, 256)
+    assert found.run(256, at=LoopState(1, 256)) == LoopState(1, 256)
     assert torch.equal(found.state.params, before)
 
 
@@ -353,7 +353,7 @@ def test_a_checkpoint_of_other_environments_is_refused():
     saved = []
     one.run(512, checkpoint_every=1, on_checkpoint=saved.append)
     with pytest.raises(SkillweaveError, match=r"'age' of open episodes is int64 \(16,\)"):
-        other.resume(saved[0].extra, Progress(saved[0].at.update, saved[0].at.steps))
+        other.resume(saved[0].extra, LoopState(saved[0].at.update, saved[0].at.steps))
 
 
 # Divergence and stopping

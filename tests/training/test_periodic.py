@@ -20,8 +20,8 @@ from skillweave import (
     TrainDefaults,
 )
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.envs import checks
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
+from skillweave.envs import checked
 from skillweave.experience.collector import RETURN
 from skillweave.experience.learners import Alone
 from skillweave.runs.directory import RunDirectory
@@ -73,12 +73,12 @@ def test_an_episode_that_never_ends_counts_as_it_stands_at_the_limit(monkeypatch
             obs, reward, terminated, truncated = super().play(action)
             return np.minimum(obs, 5), reward, terminated & (np.arange(2) == 0), truncated
 
-    monkeypatch.setattr(checks, "LONG_EPISODE", 8)
+    monkeypatch.setattr(checked, "LONG_EPISODE", 8)
     assert played(Forever(2)) == [5.0, 8.0]
 
 
 def test_the_limit_counts_environment_steps_not_decisions(monkeypatch):
-    monkeypatch.setattr(checks, "LONG_EPISODE", 25)
+    monkeypatch.setattr(checked, "LONG_EPISODE", 25)
     assert played(Calls(1, (False, True))) == [9.0]  # calls of 10 steps, of which each pays 3
 
 

@@ -27,7 +27,7 @@ from skillweave import (
 )
 from skillweave.cli import main
 from skillweave.evolution import Evolution
-from skillweave.evolution.plan import plan
+from skillweave.evolution.evolving import plan
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors

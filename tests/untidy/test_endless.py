@@ -6,7 +6,7 @@ import pytest
 from timed import Timed
 
 import skillweave as sw
-from skillweave.envs import checks
+from skillweave.envs import checked
 from skillweave.training import evaluation, stage_log
 
 SMALL = sw.PPO(num_envs=2, n_steps=32, batch_size=32, update_epochs=1, network=sw.Network((8,)))
@@ -22,7 +22,7 @@ class Limited(Timed):
 
 @pytest.fixture(autouse=True)
 def soon(monkeypatch):
-    for module in (checks, stage_log):
+    for module in (checked, stage_log):
         monkeypatch.setattr(module, "LONG_EPISODE", 100)
 
 

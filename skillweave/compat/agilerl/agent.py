@@ -13,13 +13,13 @@ import numpy as np
 import torch
 
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy, make_algorithm, state_from
 from skillweave.algorithms.batches import Sample
-from skillweave.algorithms.policy import AgentHeader, AgentPolicy, make_algorithm, state_from
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.mutation import with_settings
 from skillweave.evolution.stacks import Member, copy
 from skillweave.networks.config import CNN, Network
-from skillweave.policies.files import check_file, shown
+from skillweave.policies.untrusted import check_file, shown
 from skillweave.runs.files import read_tensors, record_in, write_tensors
 from skillweave.spaces import to_tensor
 from skillweave.types import Array
@@ -36,13 +36,13 @@ class Setting:
         self.field = field
         self.inverse = inverse
 
-    def __get__(self, agent: Agent | None, owner: type) -> Any:
+    def __get__(self, agent: AgilerlAgent | None, owner: type) -> Any:
         if agent is None:
             return self
         value = getattr(agent.member.config, self.field)
         return round(1.0 / value) if self.inverse else value
 
-    def __set__(self, agent: Agent, value: Any) -> None:
+    def __set__(self, agent: AgilerlAgent, value: Any) -> None:
         agent.set(**self.native(value))
 
     def native(self, value: Any) -> dict[str, Any]:
@@ -51,7 +51,7 @@ class Setting:
         return {self.field: 1.0 / float(value) if self.inverse else value}
 
 
-class Agent:
+class AgilerlAgent:
     """An agent with AgileRL's interface: a member of P = 1 with its history."""
 
     algo: ClassVar[str]

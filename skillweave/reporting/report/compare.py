@@ -11,7 +11,6 @@ import numpy as np
 
 from skillweave.reporting.palette import color_of, hex_of
 from skillweave.reporting.report import charts, facts
-from skillweave.reporting.report.calls import rounded
 from skillweave.reporting.report.curves import Curves, metrics_of, read_curves
 from skillweave.reporting.report.facts import (
     NOTHING,
@@ -31,6 +30,7 @@ from skillweave.reporting.report.groups import (
     over_seeds,
 )
 from skillweave.reporting.report.page import Page, library
+from skillweave.reporting.report.timelines import rounded
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation

@@ -28,7 +28,7 @@ USUAL_FPS = 30
 
 
 @dataclass(frozen=True)
-class Film:
+class Mp4:
     """An MP4 of several shots, one after another."""
 
     data: bytes
@@ -78,7 +78,7 @@ def make_film(
     check_spaces: Callable[[gym.Space[Any], gym.Space[Any]], None] | None = None,
     *,
     quiet: bool = True,
-) -> Film:
+) -> Mp4:
     """Play shots again, one after another, and film them.
 
     Args:
@@ -109,7 +109,7 @@ def make_film(
                 for key, shot in shots.items():
                     first[key] = video.frames
                     _play(shot, env, engine, video, every, progress)
-            return Film(path.read_bytes(), fps, every, first)
+            return Mp4(path.read_bytes(), fps, every, first)
     finally:
         engine.close()
 

@@ -18,14 +18,6 @@ from skillweave.reporting.lineage import read_lineage, setting_title, short_valu
 from skillweave.reporting.palette import RGB, color_of, hex_of, is_light
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report import charts, facts
-from skillweave.reporting.report.calls import (
-    chosen_episodes,
-    decision_data,
-    episode_data,
-    names_misfit,
-    rounded,
-    seen,
-)
 from skillweave.reporting.report.curves import metrics_of, reached_steps, read_curves, thinned
 from skillweave.reporting.report.facts import (
     WHY,
@@ -43,9 +35,17 @@ from skillweave.reporting.report.facts import (
     verdict,
 )
 from skillweave.reporting.report.film import episode_shot, make_film
-from skillweave.reporting.report.goals import goal_pictures
-from skillweave.reporting.report.handover import add_handover
+from skillweave.reporting.report.goal_maps import goal_pictures
+from skillweave.reporting.report.matrix import add_handover
 from skillweave.reporting.report.page import Page, library
+from skillweave.reporting.report.timelines import (
+    chosen_episodes,
+    decision_data,
+    episode_data,
+    names_misfit,
+    rounded,
+    seen,
+)
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.schema import AtLeastOne, Count, fitted
@@ -53,7 +53,7 @@ from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
-from skillweave.training.play import Played as PlayedStep
+from skillweave.training.play import PlayedStep as PlayedStep
 from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 from skillweave.training.skill_report import levels_of, skill_rows
 from skillweave.types import Policy

@@ -1,3 +1,3 @@
 """AgileRL's DDPG."""
 
-from skillweave.compat.agilerl.agents import DDPG as DDPG
+from skillweave.compat.agilerl.agent_classes import DDPG as DDPG

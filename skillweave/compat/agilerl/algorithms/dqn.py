@@ -1,3 +1,3 @@
 """AgileRL's DQN."""
 
-from skillweave.compat.agilerl.agents import DQN as DQN
+from skillweave.compat.agilerl.agent_classes import DQN as DQN

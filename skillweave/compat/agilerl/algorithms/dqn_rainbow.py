@@ -1,3 +1,3 @@
 """AgileRL's RainbowDQN."""
 
-from skillweave.compat.agilerl.agents import RainbowDQN as RainbowDQN
+from skillweave.compat.agilerl.agent_classes import RainbowDQN as RainbowDQN

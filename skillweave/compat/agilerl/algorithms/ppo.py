@@ -1,3 +1,3 @@
 """AgileRL's PPO."""
 
-from skillweave.compat.agilerl.agents import PPO as PPO
+from skillweave.compat.agilerl.agent_classes import PPO as PPO

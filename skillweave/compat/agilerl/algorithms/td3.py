@@ -1,3 +1,3 @@
 """AgileRL's TD3."""
 
-from skillweave.compat.agilerl.agents import TD3 as TD3
+from skillweave.compat.agilerl.agent_classes import TD3 as TD3

@@ -6,7 +6,7 @@ from typing import Any
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from skillweave._internal.messages import suggest
-from skillweave.compat.agilerl.agents import KINDS
+from skillweave.compat.agilerl.agent_classes import KINDS
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.envs.obs_names import ObsNames
-from skillweave.reporting.report.film import Film
+from skillweave.reporting.report.film import Mp4
 from skillweave.training.played_calls import Episode, PlayedEpisodes
 from skillweave.types import Array
 
@@ -29,7 +29,7 @@ def chosen_episodes(episodes: Sequence[Episode], count: int) -> list[int]:
 
 
 def episode_data(
-    log: PlayedEpisodes, film: Film | None, named: ObsNames | None = None
+    log: PlayedEpisodes, film: Mp4 | None, named: ObsNames | None = None
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Return each episode with its calls, and sentences about parts that are left out.
 

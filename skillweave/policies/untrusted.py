@@ -10,7 +10,7 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from .errors import RunError
+from .acting_errors import RunError
 
 DEEPEST = 100
 """The deepest nesting of JSON, so that its readers may be recursive."""

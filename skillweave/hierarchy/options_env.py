@@ -11,9 +11,9 @@ from gymnasium.vector.utils import batch_space
 
 from skillweave._internal.messages import short
 from skillweave._internal.seeding import Seeds
-from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.envs.checked import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
-from skillweave.envs.infos import allowed_rows
+from skillweave.envs.env_infos import allowed_rows
 from skillweave.errors import DeclarationError
 from skillweave.policies.core import RUNNING, Turn, World, restart
 from skillweave.policies.floats import usual_floats

@@ -9,7 +9,7 @@ import numpy as np
 
 from skillweave._internal.paths import SELECTOR
 from skillweave.algorithms.batches import Batch, Trace, padded_last_axis
-from skillweave.experience.levels import Level
+from skillweave.experience.levels import LearningLevel
 from skillweave.experience.restored import known
 from skillweave.policies.hierarchy import unless_none
 from skillweave.policies.parts import OBSERVATION
@@ -30,7 +30,7 @@ class OpenCalls:
     """
 
     def __init__(
-        self, level: Level, shaped: dict[str, Array], *, keep_rewards: bool = False
+        self, level: LearningLevel, shaped: dict[str, Array], *, keep_rewards: bool = False
     ) -> None:
         n, hierarchy, self._shaped = len(level.memory["skill"]), level.hierarchy, shaped
         self.level, self.keep_rewards = level, keep_rewards

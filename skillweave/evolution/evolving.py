@@ -10,9 +10,9 @@ from skillweave.algorithms.config import config_from_json
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.evolution.config import Evolution, evolution_to_json
+from skillweave.evolution.generations import EvolvingPopulation
 from skillweave.evolution.mutation import check_mutations
-from skillweave.evolution.part import too_many
-from skillweave.evolution.stage import EvolvingPopulation
+from skillweave.evolution.shard import too_many
 from skillweave.runs.manifest import StageEntry, Target
 from skillweave.schema import fitted
 from skillweave.training.agents import Agents

@@ -8,7 +8,7 @@ from skillweave.api import Hierarchy, Run, TrainedPolicy
 from skillweave.envs.make import make_engine
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.fitting import ready_policies
-from skillweave.hierarchy.options import OptionsEnv
+from skillweave.hierarchy.options_env import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import roles_of
 from skillweave.schema import AtLeastOne, Share, fitted

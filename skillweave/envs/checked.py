@@ -18,8 +18,8 @@ import numpy as np
 
 from skillweave._internal.messages import error_text, short
 from skillweave._internal.notices import notice
+from skillweave.envs.env_infos import MASK, observes_mask
 from skillweave.envs.image_bounds import ImageBounds
-from skillweave.envs.infos import MASK, observes_mask
 from skillweave.envs.pool import first_row
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.policies.floats import by_program

@@ -13,8 +13,8 @@ from gymnasium import Space
 from skillweave._internal.messages import short, shortened, suggest
 from skillweave.errors import PolicyError
 from skillweave.policies.mapped import (
+    Affine,
     Input,
-    Linear,
     Outputs,
     Shapes,
     Take,
@@ -165,7 +165,7 @@ class _Reader:
         return Take("observation", leaf.shape, path, None, choices, whole)
 
 
-def _scaling(parts: Sequence[tuple[Any, int, str]], shape: tuple[int, ...]) -> tuple[Linear, ...]:
+def _scaling(parts: Sequence[tuple[Any, int, str]], shape: tuple[int, ...]) -> tuple[Affine, ...]:
     """Return the scaling of an input of parts: settings, width, and name in messages of each."""
     columns: list[Array | None] = []
     neutral = ("offset", 0.0), ("scale", 1.0), ("clip", -np.inf), ("clip", np.inf)
@@ -178,7 +178,7 @@ def _scaling(parts: Sequence[tuple[Any, int, str]], shape: tuple[int, ...]) -> t
             wide.append(_wide(value, n, f"{where}.{name}"))
         column = np.concatenate(wide).reshape(shape)
         columns.append(None if (column == default).all() else column)
-    return () if all(x is None for x in columns) else (Linear(*columns),)
+    return () if all(x is None for x in columns) else (Affine(*columns),)
 
 
 def _wide(value: float | tuple[float, ...], n: int, where: str) -> Array:

@@ -11,7 +11,7 @@ import gymnasium as gym
 from skillweave._internal.messages import short
 from skillweave.algorithms.config import AlgorithmConfig, OnPolicy
 from skillweave.buffers.ram import check_memory
-from skillweave.envs.checks import is_batched, refuse_batched
+from skillweave.envs.checked import is_batched, refuse_batched
 from skillweave.envs.make import EnvSpec
 from skillweave.schema import Check
 from skillweave.spaces import obs_dtype, obs_shape

@@ -18,12 +18,12 @@ from torch import Tensor
 from skillweave._internal import interrupts
 from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm, state_from
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
 from skillweave.errors import RunError
 from skillweave.evolution.config import Evolution, evolution_from_json
-from skillweave.evolution.part import FitnessEnvs, policy_of
 from skillweave.evolution.population import Population
+from skillweave.evolution.shard import FitnessEnvs, policy_of
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member
 from skillweave.networks.config import Network
@@ -35,7 +35,7 @@ from skillweave.workers.placement import LOCAL, Placement
 
 
 @dataclass
-class Best:
+class Champion:
     """The best member so far, with whose policy the stage ends.
 
     Its fitness is measured in the latest generation's episodes.
@@ -63,7 +63,7 @@ class EvolvingPopulation:
         self.task, self.config = stage.learning_task, stage.config
         label = f"{stage.run.path / 'run.json'}: stage {stage.entry.name!r}"
         self.evolution = evolution_from_json(stage.entry.evolution or {}, label, selection)
-        self.best: Best | None = None
+        self.best: Champion | None = None
         self.done = 0
         """The number of complete generations."""
         self.fitness_steps = 0
@@ -209,7 +209,7 @@ class EvolvingPopulation:
         if self.best is None or fitness.max() >= self.best.fitness:
             member = self.population.members[int(fitness.argmax())]
             policy = policy_of(member, self.population.spaces)
-            self.best = Best(float(fitness.max()), member.number, self.done, policy)
+            self.best = Champion(float(fitness.max()), member.number, self.done, policy)
 
     def _note(self, fitness: Array) -> None:
         """Log the generation, and report it."""
@@ -266,7 +266,7 @@ class EvolvingPopulation:
         self.fitness_steps = at.fitness_steps
         if (best := at.best) is not None:
             policy = AgentPolicy.from_file(unprefixed("best", tensors), best.policy, where)
-            self.best = Best(best.fitness, best.number, best.generation, policy)
+            self.best = Champion(best.fitness, best.number, best.generation, policy)
         members = [
             self._restored(entry, unprefixed(str(i), tensors), f"{where}: member {i}")
             for i, entry in enumerate(at.members)

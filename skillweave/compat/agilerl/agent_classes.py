@@ -8,7 +8,7 @@ import torch
 
 from skillweave.algorithms import config
 from skillweave.algorithms.batches import Rollout
-from skillweave.compat.agilerl.agent import MLP, Agent, Setting, tensor_of
+from skillweave.compat.agilerl.agent import MLP, AgilerlAgent, Setting, tensor_of
 from skillweave.compat.numpy_actor import NumpyActor
 from skillweave.errors import DeclarationError
 from skillweave.evolution.stacks import Member
@@ -16,7 +16,7 @@ from skillweave.spaces import to_tensor
 from skillweave.types import Array
 
 
-class PPO(Agent):
+class PPO(AgilerlAgent):
     """A PPO agent."""
 
     algo = "PPO"
@@ -118,7 +118,7 @@ class PPO(Agent):
         )
 
 
-class DQN(Agent):
+class DQN(AgilerlAgent):
     """A DQN agent."""
 
     algo = "DQN"
@@ -158,7 +158,7 @@ class DQN(Agent):
         return self.learn_sample(self.gamma, experiences[:5])[0]["loss"]
 
 
-class RainbowDQN(Agent):
+class RainbowDQN(AgilerlAgent):
     """A DQN agent with every extension of Rainbow."""
 
     algo = "Rainbow DQN"
@@ -220,7 +220,7 @@ class RainbowDQN(Agent):
         return metrics["loss"], experiences[6], errors + self.prior_eps
 
 
-class TD3(Agent):
+class TD3(AgilerlAgent):
     """A TD3 agent."""
 
     algo = "TD3"

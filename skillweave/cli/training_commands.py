@@ -25,7 +25,7 @@ from skillweave.training.options import Continuing, Starting
 from skillweave.workers.cluster import Ray
 
 
-def train(command: commands.Train) -> Result:
+def train(command: commands.TrainCommand) -> Result:
     """Train a recipe, and perhaps the flat baseline after it."""
     fitted(Count, command.evaluate, "evaluate")
     if command.versus_flat and command.flat:
@@ -60,7 +60,7 @@ def train(command: commands.Train) -> Result:
     return result, "\n".join(lines)
 
 
-def resume(command: commands.Resume) -> Result:
+def resume(command: commands.ResumeCommand) -> Result:
     """Finish a run that was stopped."""
     run = RunDirectory.open(command.run)
     declared = declared_by(run, command.recipe, to_train=True)
@@ -72,7 +72,7 @@ def resume(command: commands.Resume) -> Result:
 
 
 def _trained(
-    command: commands.Train,
+    command: commands.TrainCommand,
     hierarchy: Hierarchy,
     flat: bool,
     out: Path | None,
@@ -145,7 +145,7 @@ def _verdict(hierarchy: dict[str, Any], flat: dict[str, Any]) -> list[str]:
 
 
 def _summary(
-    command: commands.Train | commands.Resume, trained: Run, render: bool = False
+    command: commands.TrainCommand | commands.ResumeCommand, trained: Run, render: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
     """Return the results of a run, for programs and for people."""
     run = RunDirectory.open(trained.path)

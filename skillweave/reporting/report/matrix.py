@@ -19,10 +19,10 @@ from skillweave.planning.handover import CallEnds, before_each
 from skillweave.planning.neighbors import evenly
 from skillweave.policies.spaces import space_of
 from skillweave.reporting.report import charts
-from skillweave.reporting.report.calls import coordinates, names_misfit, rounded, varying
 from skillweave.reporting.report.facts import WHY, WORDS, number, percent, scale_of, span
-from skillweave.reporting.report.film import HOLD, Film, Shot, make_film
+from skillweave.reporting.report.film import HOLD, Mp4, Shot, make_film
 from skillweave.reporting.report.page import Page
+from skillweave.reporting.report.timelines import coordinates, names_misfit, rounded, varying
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.goals import goals_of
@@ -65,7 +65,7 @@ def add_handover(
         filmed: play calls again, and film them.
     """
     matrix, named = log.handover(), None
-    film: Film | None = None
+    film: Mp4 | None = None
     before = before_each(log, log.succeeded)
     cells = {
         (i, j): np.flatnonzero((before == i) & (log.skill == j))
@@ -193,7 +193,7 @@ def _cell(matrix: Handover, i: int, j: int, reasons: Mapping[str, int]) -> dict[
 # The film: clips of calls, each with the end of the call before
 
 
-def _clip(log: CallLog, row: int, film: Film, with_goals: Mapping[str, Skill]) -> dict[str, Any]:
+def _clip(log: CallLog, row: int, film: Mp4, with_goals: Mapping[str, Skill]) -> dict[str, Any]:
     """Return a clip for the page's script."""
     (before, lead, steps), first = _extent(log, row), film.first[row]
     return {

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.config import AlgorithmConfig
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.buffers.replay import ReplayStore
 from skillweave.envs.joined import JoinedEngines
 from skillweave.errors import EnvError, SkillweaveError
@@ -28,7 +28,7 @@ from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, EpisodeTally, Tick
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.learning_task import LearningTask
-from skillweave.training.loop import Loop, Progress
+from skillweave.training.loop import Loop, LoopState
 from skillweave.training.periodic import episodes_of
 from skillweave.training.replay_learner import ReplayLearner, check_counts, store_of
 from skillweave.types import Array
@@ -37,7 +37,7 @@ OnGenerationTick = Callable[[int, dict[str, float]], None]
 """Receives the steps of all members in this generation so far, and the metrics of an update."""
 
 
-class Part:
+class Shard:
     """A part of a population: places, each with environments in which a member trains.
 
     Results are a function of members, seeds and its state.
@@ -119,7 +119,7 @@ class Part:
                 self.episodes,
                 own,
                 until * count,
-                Progress(self.rounds, start),
+                LoopState(self.rounds, start),
                 schedule_steps=schedule_steps * count,
                 skip_diverged=True,
                 on_tick=_counting_from(on_tick, spent - start),
