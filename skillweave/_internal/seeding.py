@@ -163,7 +163,8 @@ class GlobalDraws:
 
     def begin(self) -> None:
         """Store the states of the generators."""
-        self._before, self._changes = _fingerprints(), _changes
+        self._before = _fingerprints()
+        self._changes = _changes
 
     def end(self) -> list[str]:
         """Return the modules whose generators were drawn from since ``begin``."""

@@ -386,7 +386,8 @@ class Algorithm:
         """
         grad = self.layout.gradient(loss, leaves)
         norm = clip_grad_norm_(grad, state.max_grad_norm if max_norm is None else max_norm)
-        moments, eps = (state.mu, state.nu, state.count), self.config.adam_eps
+        moments = (state.mu, state.nu, state.count)
+        eps = self.config.adam_eps
         adam_(state.params, grad, *moments, rate, eps=eps, active=active)
         return norm
 

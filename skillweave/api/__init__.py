@@ -278,7 +278,9 @@ class TrainedPolicy:
     """In names of files, where this is not what is written under ``path``."""
 
     def __init__(self, declaration: Hierarchy | Agent, path: Path, policy: Policy) -> None:
-        self.declaration, self.path, self.policy = declaration, path, policy
+        self.declaration = declaration
+        self.path = path
+        self.policy = policy
         self._calls = RunCalls(path)
         self._player: Player | None = None
 
@@ -840,7 +842,8 @@ class PlannedRun(TrainedPolicy):
         Raises:
             DeclarationError: an argument is wrong, or the selector cannot start from a plan.
         """
-        spec, planner = self._own_spec(), self.hierarchy.selector
+        spec = self._own_spec()
+        planner = self.hierarchy.selector
         assert isinstance(self.policy, HierarchyPolicy)
         assert isinstance(planner, Planner)
         config: Any = PPO() if algorithm is None else algorithm

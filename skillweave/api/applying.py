@@ -48,7 +48,8 @@ def load_policy(declared: D, path: Path) -> Trained[D]:
     run = RunDirectory.open(path)
     declared.validate()
     with called_by(declared._caller):
-        given, declared = declared, apply_manifest(declared, run)
+        given = declared
+        declared = apply_manifest(declared, run)
         if isinstance(given, Declaration) and isinstance(declared, Declaration):
             _notice_limits(roles_of(given), roles_of(declared), run)
         if run.manifest.hierarchy is None:
@@ -122,7 +123,8 @@ def differences(content: Manifest, run: RunDirectory, *, budgets: bool = True) -
         content: the manifest that a new run would have.
         budgets: compare the steps of stages, too.
     """
-    here, there = settings(content), settings(run.manifest)
+    here = settings(content)
+    there = settings(run.manifest)
     if not budgets:
         here = {k: v for k, v in here.items() if not k.endswith(".budget")}
     evolve = tuple(f"{s.name}." for s in run.manifest.stages if s.evolution)
@@ -215,7 +217,8 @@ def _check_place(spec: EnvSpec, what: str, run: RunDirectory) -> None:
         return
     renamed = ""
     if theirs == mine:
-        theirs, mine = f"{theirs} made with {their_kwargs}", f"one made with {my_kwargs}"
+        theirs = f"{theirs} made with {their_kwargs}"
+        mine = f"one made with {my_kwargs}"
     elif not isinstance(spec.env, str):
         renamed = f". If its function was only renamed, set {mine}.__name__ = {theirs!r}"
     raise RunError(

@@ -74,7 +74,8 @@ def _check_same(content: Manifest, run: RunDirectory) -> None:
     manifest = run.manifest
     if content.kind != manifest.kind:
         flat = "--flat" if from_command_line() else "flat=True"
-        one, other = f"a flat agent ({flat})", "a hierarchy"
+        one = f"a flat agent ({flat})"
+        other = "a hierarchy"
         if manifest.hierarchy is not None:
             one, other = other, one
         raise RunError(

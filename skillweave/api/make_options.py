@@ -41,7 +41,8 @@ def make_options_env(
         skills, spec = hierarchy.policy.skills, hierarchy.hierarchy.spec
     else:
         roles = roles_of(hierarchy)
-        ready, spec = ready_policies(roles), roles.spec
+        ready = ready_policies(roles)
+        spec = roles.spec
         lacking = [path for path in roles.outermost.skills if path not in ready]
         if lacking:
             raise DeclarationError(

@@ -166,7 +166,8 @@ def lacking_features(declared: Declaration, policy: Policy, skill: str | None = 
         policy: with the skills, of the whole hierarchy or of one level.
         skill: the name of the one that counts; None: all do.
     """
-    skills, features = skills_below(policy), declared.features
+    skills = skills_below(policy)
+    features = declared.features
     if skills is None or not obs_codec(declared.spec.spaces.observation).images:
         return ""
     for one, places in zip(skills.skills, seen_places(skills), strict=True):

@@ -65,7 +65,9 @@ def repair(
             f"{shown_path(place)} holds a run: name a new directory; or, if a repair was "
             "stopped there, add resume=True"
         )
-    steps, done, calls = options.steps or USUAL_STEPS, options.done, options.calls
+    steps = options.steps or USUAL_STEPS
+    done = options.done
+    calls = options.calls
     learnt = parts_of(roles, policy)[skill]
     assert isinstance(learnt, AgentPolicy)
     content, policies = _content(declared, source, roles, policy)
@@ -224,9 +226,11 @@ def _measured(
 
 def _stage_name(skill: str, taken: set[str]) -> str:
     """Return a name of a stage that no other one has."""
-    name, number = f"{skill}-repair", 2
+    name = f"{skill}-repair"
+    number = 2
     while name in taken:
-        name, number = f"{skill}-repair-{number}", number + 1
+        name = f"{skill}-repair-{number}"
+        number = number + 1
     return name
 
 
@@ -250,7 +254,9 @@ def _content(
         parts = parts_of(roles, policy)
         for entry in content.stages:
             # A weights file does not record its training: the declaration's steps stand for it.
-            entry.status, entry.steps, entry.seconds = "done", entry.budget, 0.0
+            entry.status = "done"
+            entry.steps = entry.budget
+            entry.seconds = 0.0
             if entry.kind == "together":
                 entry.compared = entry.greedy_judged = False
             learnt = {name: parts[name] for name in entry.learns}

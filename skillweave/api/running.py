@@ -64,7 +64,8 @@ def train(declared: D, options: AgentOptions) -> Trained[D]:
     """Check everything, start a run, or continue the one that is there, and train it."""
     declared.validate()
     flat: bool | AlgorithmConfig = False
-    note, evolve = "", options.evolve
+    note = ""
+    evolve = options.evolve
     if isinstance(options, TrainOptions):
         flat = options.flat
         if flat is not False and options.log_calls is not None:
@@ -135,7 +136,8 @@ def _kept_by_populations(content: Manifest) -> str:
 
 def _run_name(declared: Declared, content: Manifest) -> str:
     """Return the stem of a numbered directory: of the recipe, the hierarchy or the environment."""
-    name, flat = declared.spec.name, ""
+    name = declared.spec.name
+    flat = ""
     if isinstance(declared, Declaration):
         flat = "-flat" if content.hierarchy is None else ""
         name = name if declared.name == Declaration.name else declared.name
@@ -229,7 +231,8 @@ def resume(declared: D, options: ResumeOptions) -> Trained[D]:
     """Finish a run with its own settings; a message lists those that differ."""
     declared.validate()
     run = RunDirectory.open(as_path(options.run_dir, "run_dir"))
-    applied, note = apply_manifest(declared, run), ""
+    applied = apply_manifest(declared, run)
+    note = ""
     if not declared.recorded and declared.recipe is None:  # the command line may change a recipe
         flat = run.manifest.hierarchy is None
         note = differences(training.manifest(declared, seed=run.manifest.seed, flat=flat), run)

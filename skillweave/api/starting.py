@@ -238,7 +238,8 @@ def _learnt_by_name(
 
 def _check_start(role: Role, algorithm: Algorithm, content: Manifest, learnt: Learnt) -> None:
     """Raise a RunError where a learner cannot start from its policy in another run."""
-    before, chooses = learnt.policy.algorithm, options_of(content, role.path)
+    before = learnt.policy.algorithm
+    chooses = options_of(content, role.path)
     goal_space = None if role.skill is None else role.skill.goal_space
     kinds = [type(a.config).__name__ for a in (before, algorithm)]
     there, here = before.weight_shapes(), algorithm.weight_shapes()
@@ -264,7 +265,8 @@ def _check_start(role: Role, algorithm: Algorithm, content: Manifest, learnt: Le
         raise RunError(cannot + what)
     entry = content.by_path.get(role.path)
     for field in ("sees", "acts", "residual"):
-        then, now = getattr(learnt.entry or entry, field, None), getattr(entry, field, None)
+        then = getattr(learnt.entry or entry, field, None)
+        now = getattr(entry, field, None)
         if entry is not None and then != now:
             raise RunError(
                 f"{cannot}there its {field} was {shown(then)}, and here it is "

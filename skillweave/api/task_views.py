@@ -95,8 +95,11 @@ class OwnSelector(ReadySelector):
 
     def __init__(self, selector: Any, view: OwnView) -> None:
         super().__init__(selector.name)
-        self.selector, self._view = selector, view
-        self.kind, self.skills, self.lengths = selector.kind, selector.skills, selector.lengths
+        self.selector = selector
+        self._view = view
+        self.kind = selector.kind
+        self.skills = selector.skills
+        self.lengths = selector.lengths
 
     def among(self, skills: tuple[str, ...]) -> Self:
         """Return a copy that chooses among the skills of these names."""

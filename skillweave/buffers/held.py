@@ -108,7 +108,9 @@ def check_columns(
         actions: the number of discrete actions; 0: actions are continuous.
     """
     steps = written.get("steps", np.ones(1))
-    kind, action, newest = written["kind"], written["action"], written["newest"]
+    kind = written["kind"]
+    action = written["action"]
+    newest = written["newest"]
     transition = kind > 0
     filled = transition.reshape(-1, len(newest)).any(0)  # (N,), columns with a transition
     in_range = {

@@ -129,7 +129,8 @@ class ReplayStore:
         self, index: Array, weight: Array | None, gamma: Tensor, progress: float = 0.0
     ) -> Sample:
         """Return the transitions ``index`` (P, B), perhaps from a sample of another store."""
-        columns, data = self._columns, self._columns.data
+        columns = self._columns
+        data = self._columns.data
         factor = gamma.float().cpu().numpy()[:, None]
         slot = start = index % columns.slots
         goes_on = np.ones(start.shape, bool)

@@ -84,7 +84,8 @@ class Columns:
         """(N,) the newest slot of each column, counted from the first in the run."""
         self._column = np.arange(num_envs)
         self._open = np.zeros(num_envs, bool)  # True where the trajectory goes on
-        self._space, self._choices = observation_space, choices
+        self._space = observation_space
+        self._choices = choices
         self._keeps_rewards = keep_rewards
         self.raw = tuple(raw)
         # The rewards of calls one after another; "call" holds the first place of a slot's rewards.
@@ -189,7 +190,9 @@ class Columns:
     def _add(self, rows: Batch) -> tuple[Array, Array]:
         """Append rows that fit into each column at once."""
         data = self.data
-        valid, mask, next_mask = rows.get("valid"), rows.get("mask"), rows.get("next_mask")
+        valid = rows.get("valid")
+        mask = rows.get("mask")
+        next_mask = rows.get("next_mask")
         slot = self._claim(rows)
         after = self.after(slot)
 
@@ -226,7 +229,8 @@ class Columns:
 
     def _claim(self, rows: Batch) -> Array:
         """Reserve slots (k,) for the valid rows, in the order of time."""
-        valid, ended = rows.get("valid"), rows.ended
+        valid = rows.get("valid")
+        ended = rows.ended
         place = (self.newest + ~self._open)[None]
         if len(ended) > 1:  # a slot for each row before, and for each end before
             before = np.ones_like(ended) if valid is None else valid

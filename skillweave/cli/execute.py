@@ -259,7 +259,8 @@ def _handover_lines(matrix: Handover | str | None) -> list[str]:
 
 def run_lines(manifest: Manifest, saved: Iterable[SavedEvaluation], target: object) -> list[str]:
     """Return a run's manifest and its saved evaluations, as lines."""
-    created, level = one_line(manifest.created), manifest.hierarchy
+    created = one_line(manifest.created)
+    level = manifest.hierarchy
     lines = [f"{manifest.kind} on {one_line(manifest.env)}, seed {manifest.seed}, made {created}"]
     calls = ""
     if level is not None:

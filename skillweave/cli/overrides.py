@@ -58,7 +58,8 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
         DeclarationError: no such setting (with a similar one), or a value out of range.
     """
     owners: dict[tuple[str, ...], Changes] = {}
-    names, steps = [], declaration.steps
+    names = []
+    steps = declaration.steps
     for setting in overrides:
         name, text = _split(
             setting, f"--set {setting!r}: write name=value, for example call_steps=20"
@@ -102,7 +103,8 @@ def _set_total(
         before: the declaration's own ``steps``.
         parts: names of budgets that were set, too.
     """
-    trained, stages = declaration.total_steps, len(declaration.budgets())
+    trained = declaration.total_steps
+    stages = len(declaration.budgets())
     if not trained or abs(trained - total) <= stages:  # shares are rounded
         return
     if parts:
@@ -141,7 +143,8 @@ def _change(declaration: Declaration, owner: tuple[str, ...], changes: Changes) 
     holder: Any = declaration.train_defaults if head == "flat" else declaration
     field = GROUPS.get(head, head)
     if head == "skills":
-        holder, field = declaration.skill(owner[1]), "algorithm"
+        holder = declaration.skill(owner[1])
+        field = "algorithm"
     config = getattr(holder, field)
     if config is None and field in ("algorithm", "flat"):
         config = declaration.algorithm

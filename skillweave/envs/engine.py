@@ -189,7 +189,8 @@ class WatchedEngine:
 
     def _stepped(self, raw: RawStep, ids: Array) -> RawStep:
         """Return the result of a step, which is checked, and truncated after too many steps."""
-        n, over = len(ids), raw.terminated | raw.truncated
+        n = len(ids)
+        over = raw.terminated | raw.truncated
         self._masks.see(raw.info, ids, over, raw.next_obs)
         self._watch.check_step(raw, ids)
         ended = b"\1" in over.tobytes()  # for small arrays ten times as fast as any()
@@ -232,7 +233,8 @@ class GymnasiumEngine(WatchedEngine):
         env = self.envs[0]
         super().__init__(env, num_envs, name, first, env.observation_space)
         self._check_seed = check_seed and first == 0
-        self._make, self._started = make, False
+        self._make = make
+        self._started = False
         self.trains = False
         """Learners learn from these environments."""
         self._draws = GlobalDraws(LOOKS if are_collected() else 0)
@@ -306,7 +308,8 @@ class GymnasiumEngine(WatchedEngine):
         """Reset environments ``ids`` (n,) to their seeds."""
         if self._draws.looks:
             self._draws.begin()
-        obs, infos = self._empty(len(ids)), []
+        obs = self._empty(len(ids))
+        infos = []
         for row, (i, seed) in enumerate(zip(ids.tolist(), self._seed[ids].tolist(), strict=True)):
             observation, info = self.envs[i].reset(seed=seed)
             with np.errstate(over="ignore"):
@@ -320,7 +323,9 @@ class GymnasiumEngine(WatchedEngine):
     def _act(self, action: Array, ids: Array) -> RawStep:
         assert not self._over[ids].any(), "an episode that is over must be reset first"
         n = len(ids)
-        obs, infos, reward = self._empty(n), [], np.zeros(n)
+        obs = self._empty(n)
+        infos = []
+        reward = np.zeros(n)
         terminated, truncated = np.zeros(n, bool), np.zeros(n, bool)
         # A copy: environments receive views of it, and may keep them.
         acted = np.array(action, self._action_dtype)

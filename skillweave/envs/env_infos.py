@@ -182,7 +182,8 @@ def reported_success(info: Mapping[str, Any], n: int) -> Array | None:
     so_far = info.keys_so_far.examples if isinstance(info, Infos) else {}
     if not any(name in info or name in so_far for name in names):
         return None
-    success, given = np.zeros(n), np.zeros(n, bool)
+    success = np.zeros(n)
+    given = np.zeros(n, bool)
     for name in reversed(names):
         if name in info:
             values, present, _ = _column(info, name, n)
@@ -245,7 +246,8 @@ def _column(
     batched = isinstance(column, np.ndarray) and column.shape[:1] == (n,)
     if batched and column.size == n and column.dtype.kind in "biuf":
         return np.where(present, column.reshape(n)[ids], np.nan).astype(float), present, None
-    numbers, odd = np.full(len(ids), np.nan), None
+    numbers = np.full(len(ids), np.nan)
+    odd = None
     for row in np.flatnonzero(present):
         value = column[ids[row]] if batched else column
         number = one_number(value)

@@ -79,7 +79,8 @@ class History:
         Raises:
             ValueError: it is not a history of N environments.
         """
-        length, action = state["length"], self._packed(state["action"])
+        length = state["length"]
+        action = self._packed(state["action"])
         begins = state["begins"]
         fits = length.shape == self.length.shape and length.dtype.kind == "i"
         if not fits or length.min(initial=0) < 0 or length.sum() != len(action):

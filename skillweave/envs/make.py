@@ -378,7 +378,8 @@ def _step_seconds(env: gym.Env[Any, Any]) -> float:
     space = env.observation_space
     rng = np.random.default_rng(0)
     masks = ActionMasks(env.action_space, 1, space)
-    means, form = [], space_of(env.action_space)
+    means = []
+    form = space_of(env.action_space)
 
     def see(obs: Any, info: dict[str, Any], ended: bool = False) -> None:
         batch = np.zeros((1, *obs_shape(space)), obs_dtype(space))

@@ -146,7 +146,8 @@ def _play(
         beside: environment 1 is reset after environment 0, and stepped before each of its steps.
     """
     until = time.monotonic() + seconds
-    row, other = np.arange(1), np.arange(1, 2)
+    row = np.arange(1)
+    other = np.arange(1, 2)
     rng, other_rng = np.random.default_rng(0), np.random.default_rng(1)
     outcome: Outcome = []
     with global_generators(Seeds(0) / "check"):

@@ -111,7 +111,8 @@ def _kernels(member: Member, cnn: CNN, mutations: Mutations, spaces: Any) -> lis
 
 def _steps(size: int, by: int, limits: tuple[int, int]) -> list[int]:
     """Return the possible growth and shrinkage of a size within its limits."""
-    grown, shrunk = min(limits[1], size + by) - size, max(limits[0], size - by) - size
+    grown = min(limits[1], size + by) - size
+    shrunk = max(limits[0], size - by) - size
     return [step for step, ok in ((grown, grown > 0), (shrunk, shrunk < 0)) if ok]
 
 
@@ -192,7 +193,8 @@ def _carried(
     named = {k: before.layout.views(flat[k].reshape(-1, before.layout.size)) for k in names}
     for _, net in before.nets:
         for part in _parts_of(net, change):
-            online, activation = named[before.weights[0]], net.network.activation
+            online = named[before.weights[0]]
+            activation = net.network.activation
             alter = _altered(part, change.by, online, activation, generator)
             named = {k: alter(v, k not in before.weights) for k, v in named.items()}
     fields = {k: after.layout.flatten(v).reshape(*lead, -1) for k, v in named.items()}

@@ -59,7 +59,9 @@ class EvolvingPopulation:
     """
 
     def __init__(self, stage: StageRun, selection: Any = None, where: Placement = LOCAL) -> None:
-        self.entry, self.run, self.seeds = stage.entry, stage.run, stage.seeds
+        self.entry = stage.entry
+        self.run = stage.run
+        self.seeds = stage.seeds
         self.task, self.config = stage.learning_task, stage.config
         label = f"{stage.run.path / 'run.json'}: stage {stage.entry.name!r}"
         self.evolution = evolution_from_json(stage.entry.evolution or {}, label, selection)
@@ -73,7 +75,8 @@ class EvolvingPopulation:
 
     def open(self) -> None:
         """Create the environments of fitness measurements."""
-        task, episodes = self.task, self.evolution.episodes
+        task = self.task
+        episodes = self.evolution.episodes
         self.eval_envs = FitnessEnvs(task, episodes, self.config.num_envs)
         self._open.callback(self.eval_envs.close)
         self.parts: Parts | None = None  # members train in this process
@@ -133,7 +136,8 @@ class EvolvingPopulation:
     @property
     def _good(self) -> bool:
         """Return whether the target is reached."""
-        target, best = self.entry.target, self.best
+        target = self.entry.target
+        best = self.best
         return target is not None and best is not None and best.fitness >= target.at_least
 
     def generation(self) -> None:
@@ -239,7 +243,9 @@ class EvolvingPopulation:
         store = self.population.part.store
         if store is not None and self.config.save_buffer and not self.over:  # type: ignore[union-attr]
             tensors |= prefixed("store", store.state())
-        best, entry, weights = self.best, None, dict[str, Tensor]()
+        best = self.best
+        entry = None
+        weights = dict[str, Tensor]()
         if best is not None:
             weights, header = best.policy.to_file()
             entry = BestEntry(best.fitness, best.number, best.generation, header)
@@ -258,7 +264,8 @@ class EvolvingPopulation:
 
     def _restore(self, tensors: dict[str, Tensor]) -> None:
         """Restore the population from a checkpoint."""
-        where, name = str(self.run.path), self.entry.name
+        where = str(self.run.path)
+        name = self.entry.name
         at = self.log.at.population
         if at is None:
             raise RunError(f"{where}: the checkpoint of stage {name!r} has no population")

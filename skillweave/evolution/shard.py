@@ -108,7 +108,8 @@ class Shard:
         for i, some in enumerate(at_once, self._first):
             stacks = [self._stack(group) for group in some]
             learning = [member for group in some for member in group]
-            start, count = sum(m.steps for m in learning), len(learning)
+            start = sum(m.steps for m in learning)
+            count = len(learning)
             own = seeds if self.replays else seeds / i
             learner = self._learner(stacks, learning, own)
             places = self.places[first : first + count]
@@ -132,7 +133,8 @@ class Shard:
             spent += end.steps - start
             first += count
             if isinstance(learner, ReplayLearner):
-                self._kept, self.rounds = learner.counts(), end.update
+                self._kept = learner.counts()
+                self.rounds = end.update
 
     def _learner(
         self, stacks: list[Stack], members: Sequence[Member], seeds: Seeds
@@ -259,7 +261,8 @@ class FitnessEnvs:
 
     def __init__(self, learning_task: LearningTask, episodes: int, num_envs: int) -> None:
         rounds = -(-episodes // num_envs)
-        self._episodes, self._who = episodes, learning_task.who
+        self._episodes = episodes
+        self._who = learning_task.who
         self._engine = learning_task.engine(-(-episodes // rounds))
 
     @property
@@ -269,7 +272,8 @@ class FitnessEnvs:
 
     def score(self, policy: AgentPolicy, seeds: Seeds) -> float:
         """Return a policy's mean return of the episodes of these seeds; −inf if not finite."""
-        total, each = self._episodes, self._engine.num_envs
+        total = self._episodes
+        each = self._engine.num_envs
         played = [
             episodes_of(policy, self._who, self._engine, seeds, first, min(each, total - first))
             for first in range(0, total, each)

@@ -134,7 +134,8 @@ class PartHost:
     def train(self, task: Task) -> tuple[list[Sent], Ticks, EpisodeTally]:
         """Train members; return them, the ticks, and the tally of all episodes here so far."""
         sent, until, schedule_steps, seeds = task
-        members, ticks = _received(sent, self._part.spaces), Ticks()
+        members = _received(sent, self._part.spaces)
+        ticks = Ticks()
         self._part.train(members, until, schedule_steps, seeds, lambda *tick: ticks.append(tick))
         return _sent(members), ticks, self._part.tally
 
@@ -169,7 +170,8 @@ def _make_host(
     number: int,
 ) -> PartHost:
     seed_global_generators(seeds / "global" / number)
-    first, end = bounds[number], bounds[number + 1]
+    first = bounds[number]
+    end = bounds[number + 1]
     part = Shard(learning_task, config, seeds, end - first, first)
     return PartHost(part, FitnessEnvs(learning_task, episodes, config.num_envs))
 

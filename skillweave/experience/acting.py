@@ -103,7 +103,9 @@ class Acting:
         Args:
             every_step: all act in each of its steps, so what they need of chance is drawn at once.
         """
-        self._request, self.row, self._every = request, 0, every_step
+        self._request = request
+        self.row = 0
+        self._every = every_step
         self._noises: list[Any] = []
         self._generators = [[s.torch() for s in self._seeds(i)] for i in range(len(self.stacks))]
         if every_step and not (request.at_random or request.greedy):
@@ -133,10 +135,8 @@ class Acting:
             first = len(times)
             seeds = [action_repeat.seeds / span / "act" / (first + i) for i in range(count)]
             for rng in (node.numpy() for node in seeds):
-                chance, length = (
-                    rng.random(self.each),
-                    rng.integers(1, action_repeat.longest + 1, self.each),
-                )
+                chance = rng.random(self.each)
+                length = rng.integers(1, action_repeat.longest + 1, self.each)
                 begins = rng.integers(0, action_repeat.longest - length + 1)
                 times.append(np.stack([chance, begins, begins + length]))
             off_policy: Any = algorithm
@@ -160,7 +160,8 @@ class Acting:
         n = self.each * self.members
         if len(rows) < n:
             obs, mask, memory = (_spread(x, rows, n) for x in (obs, mask, memory))
-        acted, request = self._act(noise, obs, mask, memory), self._request
+        acted = self._act(noise, obs, mask, memory)
+        request = self._request
         repeat = request.action_repeat
         if self._every and repeat is not None and not (request.at_random or request.greedy):
             self._hold_actions(acted.action, repeat, repeat.at + self.row, mask)
@@ -178,7 +179,9 @@ class Acting:
 
     def _act(self, noise: Any, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
         """Act stack by stack, in equal numbers of rows of each member."""
-        found, first, each = [], 0, len(obs) // self.members
+        found = []
+        first = 0
+        each = len(obs) // self.members
         for stack, (_, count) in enumerate(self.stacks):
             part = slice(first * each, (first + count) * each)
             found.append(self._stack(stack, noise, *(_part(x, part) for x in (obs, mask, memory))))
@@ -207,7 +210,8 @@ class Acting:
         action, head, after = algorithm.act(params, by_member(obs, count), allowed, chance, before)
         # A member that has diverged must not spoil what all learn from.
         if not self.keeps_head:
-            action, head = action.nan_to_num(), None
+            action = action.nan_to_num()
+            head = None
         return Acted(_rows(action), _rows_or_none(head), _rows_or_none(after))
 
     def _seeds(self, stack: int) -> list[Seeds]:

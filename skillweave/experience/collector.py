@@ -89,10 +89,14 @@ class Collector:
         learners: Mapping[str, Acting] | None = None,
         margins: Mapping[str, float] | None = None,
     ) -> None:
-        self.engine, self.num_envs = engine, engine.num_envs
+        self.engine = engine
+        self.num_envs = engine.num_envs
         n = self.num_envs
-        self.acting, self.who, self.skill = acting, who, who.skill
-        self.learners, self._together = learners or {}, learners is not None
+        self.acting = acting
+        self.who = who
+        self.skill = who.skill
+        self.learners = learners or {}
+        self._together = learners is not None
         self._goals = goals_of(self.skill)
         self.obs: Array = np.empty(0)
         """(N, *obs_shape), what to act on next."""
@@ -168,7 +172,9 @@ class Collector:
 
     def collect(self, request: Request) -> Collected:
         """``request.rows`` steps of each environment."""
-        before, self._info_keys, self._ended = self.engine.steps_made, set(), []
+        before = self.engine.steps_made
+        self._info_keys = set()
+        self._ended = []
         self._prepare(request)
         writer = self._writer(request.rows)
         for _ in range(request.rows):
@@ -216,7 +222,8 @@ class Collector:
             steps += writer.row
             for _, ids, episodes in self._judge(writer.trace())[1]:
                 first = unknown[ids]
-                found[ids[first]], unknown[ids[first]] = episodes[first], False
+                found[ids[first]] = episodes[first]
+                unknown[ids[first]] = False
         found[playing, :3] = self.kept["sums"][playing]
         return found
 
@@ -246,7 +253,8 @@ class Collector:
                 "or another version of Skillweave, or damaged"
             )
         for name, values in self.kept.items():
-            found, own = kept[name], as_numbers(values)
+            found = kept[name]
+            own = as_numbers(values)
             if found.shape != own.shape or found.dtype != own.dtype:
                 raise RunError(
                     f"the checkpoint's {name!r} of open episodes is {found.dtype} {found.shape}, "
@@ -255,7 +263,8 @@ class Collector:
             own[:] = found
         check_numbers(self.kept, self.values)
         obs, early = self.engine.restore(unprefixed("engine", state))
-        self.obs, self.begun = np.array(obs), True
+        self.obs = np.array(obs)
+        self.begun = True
         space = self.engine.observation_space
         self.open.clear()
         saved = unprefixed("open", state)
@@ -280,7 +289,8 @@ class Collector:
         self.learning.begin(request, self.elapsed)
         self._greedy = request.greedy
         self._goal_rng = (request.seeds / "goals").numpy()
-        rng, last = (request.seeds / "skills").numpy(), self.kept.get("last_action")
+        rng = (request.seeds / "skills").numpy()
+        last = self.kept.get("last_action")
         self._world = World(rng, self.kept["age"], last, self.overridden)
 
     def _writer(self, rows: int) -> TraceWriter:
@@ -296,7 +306,10 @@ class Collector:
 
     def _step(self, out: TraceWriter) -> None:
         """Step every environment, and write what happened."""
-        obs, mask, rows, waiting = self.obs, self.engine.mask(), self._all, self._all[:0]
+        obs = self.obs
+        mask = self.engine.mask()
+        rows = self._all
+        waiting = self._all[:0]
         if self.search is not None:
             rows, waiting = self.search.playing(obs, self._world)
         if self.overridden is not None:
@@ -398,11 +411,13 @@ class Collector:
             rows: (k,) environments in which the policy acted.
             goal: (N, *goal_shape).
         """
-        end, skill = np.zeros(self.num_envs, np.int8), self.skill
+        end = np.zeros(self.num_envs, np.int8)
+        skill = self.skill
         if self.limit is not None:
             end[rows[self.elapsed[rows] >= self.limit]] = LIMIT
         if step is not None and len(rows):
-            elapsed, own_goal = self.elapsed[rows], None if goal is None else goal[rows]
+            elapsed = self.elapsed[rows]
+            own_goal = None if goal is None else goal[rows]
             if self.policy.watches:
                 seen = step
                 if self.search is not None or goal is not None:
@@ -432,7 +447,9 @@ class Collector:
         own = OwnSteps(trace, self.skill, acts, trace["elapsed"], trace.get("goal"))
         steps = own.rows(trace["end"])
         each = np.empty((*trace.lead, 3))
-        each[..., 0], each[..., 1], each[..., 2] = steps["reward"], trace["env_reward"] * acts, acts
+        each[..., 0] = steps["reward"]
+        each[..., 1] = trace["env_reward"] * acts
+        each[..., 2] = acts
         found = self._count(each)
         if self.skill is not None and self.skill.defines("success"):
             success = own.judged("success")
@@ -446,7 +463,8 @@ class Collector:
 
     def _count(self, each: Array) -> list[tuple[int, Array, Array]]:
         """Add numbers (T, N, 3) to the sums of the open episodes; return those that ended."""
-        found, self._ended = self._ended, []
+        found = self._ended
+        self._ended = []
         sums: Any = self.kept["sums"]
         at = 0
         for row, numbers in enumerate(each):
@@ -455,7 +473,8 @@ class Collector:
                 _, ids, episodes = found[at]
                 known = ~np.isnan(episodes[:, :3])
                 episodes[:, :3][known] = sums[ids][known]
-                sums[ids], at = 0.0, at + 1
+                sums[ids] = 0.0
+                at = at + 1
         return found
 
     def _forget(self, ids: Array) -> None:
@@ -535,7 +554,8 @@ def joined_from(collectors: Sequence[Collector], engine: Engine, acting: Acting)
     for name, example in collectors[0].open.items():
         parts = [c.open.get(name, np.zeros_like(example)) for c in collectors]
         found.open[name] = np.concatenate(padded_last_axis(parts) if name == "rewards" else parts)
-    found.obs, found.begun = np.concatenate([c.obs for c in collectors]), True
+    found.obs = np.concatenate([c.obs for c in collectors])
+    found.begun = True
     return found
 
 
@@ -549,14 +569,16 @@ def parted(joined: Collector, collectors: Sequence[Collector]) -> None:
                 rows[:] = joined.kept[name][part]
         collector.open.clear()
         collector.open |= {k: v[part].copy() for k, v in joined.open.items()}
-        collector.obs, first = joined.obs[part].copy(), part.stop
+        collector.obs = joined.obs[part].copy()
+        first = part.stop
 
 
 def joined_collected(parts: Sequence[Collected], members: int) -> Collected:
     """Join the answers of several collectors: each member's environments stand side by side."""
     if len(parts) == 1:
         return parts[0]
-    paths, steps = parts[0].batches, sum(p.steps for p in parts)
+    paths = parts[0].batches
+    steps = sum(p.steps for p in parts)
     batches = {path: side_by_side([p.batches[path] for p in parts], members) for path in paths}
     keys = frozenset[str]().union(*(p.info_keys for p in parts))
     longest = max(p.longest for p in parts)

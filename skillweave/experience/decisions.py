@@ -32,8 +32,11 @@ class OpenCalls:
     def __init__(
         self, level: LearningLevel, shaped: dict[str, Array], *, keep_rewards: bool = False
     ) -> None:
-        n, hierarchy, self._shaped = len(level.memory["skill"]), level.hierarchy, shaped
-        self.level, self.keep_rewards = level, keep_rewards
+        n = len(level.memory["skill"])
+        hierarchy = level.hierarchy
+        self._shaped = shaped
+        self.level = level
+        self.keep_rewards = keep_rewards
         self.memory_size = 0 if level.selector is None else level.selector.net.memory_size
         self.kept: dict[str, Array] = {
             "acted": np.zeros(n, bool),  # the level acted in the latest step
@@ -79,18 +82,26 @@ class OpenCalls:
         acted, is_open, total, weight, tau = (
             kept[name] for name in ("acted", "open", "reward", "discount", "tau")
         )
-        lead, acts, reward = trace.lead, steps["valid"], steps["reward"]
+        lead = trace.lead
+        acts = steps["valid"]
+        reward = steps["reward"]
         reset = trace.ended
         begins = trace.get(f"{self.level.path}{SELECTOR}/decided")
         begins = np.zeros(lead, bool) if begins is None else begins
         over, cut, first = (np.zeros(lead, bool) for _ in range(3))
-        lasted, decided = np.zeros(lead, np.int64), np.full(lead, -1)
-        sums, rewards, latest = np.zeros(lead), list[Array](), np.full(lead[1], -1)
+        lasted = np.zeros(lead, np.int64)
+        decided = np.full(lead, -1)
+        sums = np.zeros(lead)
+        rewards = list[Array]()
+        latest = np.full(lead[1], -1)
         for t in range(len(begins)):
             np.logical_and(is_open, ~acts[t], out=cut[t])
             new = begins[t]
-            total[new], weight[new], tau[new] = 0.0, 1.0, 0
-            latest[new], kept["first"][new] = t, ~acted[new]
+            total[new] = 0.0
+            weight[new] = 1.0
+            tau[new] = 0
+            latest[new] = t
+            kept["first"][new] = ~acted[new]
             is_open[cut[t]], is_open[new] = False, True
             if self.keep_rewards:
                 self._keep_rewards(new, is_open, reward[t])
@@ -99,7 +110,10 @@ class OpenCalls:
             tau += is_open
             ends = closes[t] & is_open
             np.logical_or(ends, cut[t], out=over[t])
-            sums[t], lasted[t], decided[t], first[t] = total, tau, latest, kept["first"]
+            sums[t] = total
+            lasted[t] = tau
+            decided[t] = latest
+            first[t] = kept["first"]
             if self.keep_rewards and over[t].any():
                 rewards.append(self._shaped[self.level.path + "rewards"][over[t]])
             is_open[ends] = False
@@ -130,7 +144,9 @@ class OpenCalls:
 
     def _batch(self, trace: Trace, steps: Batch, ends: Mapping[str, Array]) -> Batch:
         """Return the calls that ended as columns (D, N): some have more of them than others."""
-        row, env, cut = ends["row"], ends["env"], ends["cut"]
+        row = ends["row"]
+        env = ends["env"]
+        cut = ends["cut"]
         values = self._at_decisions(trace, ends) | {
             "reward": (ends["reward"] - self.level.skill_set.call_cost).astype(np.float32),
             "steps": ends["steps"],
@@ -160,7 +176,8 @@ class OpenCalls:
         found = {"obs": seen[ends["row"], ends["env"]]}  # if there is no call
         earlier = ends["decided"] < 0
         for name, column in DECIDED_ON.items():
-            values, held = self._decided_on(trace, column), self._held(column)
+            values = self._decided_on(trace, column)
+            held = self._held(column)
             if values is not None:
                 found[name] = values[ends["decided"], ends["env"]]
                 if held is not None:  # other networks have chosen, if it has another shape
@@ -186,7 +203,8 @@ class OpenCalls:
         self, trace: Trace, values: Mapping[str, Array], row: Array, env: Array
     ) -> Array:
         """Return where skills may start in the true successors; all where that does not matter."""
-        mask, level = np.ones_like(values["mask"]), self.level
+        mask = np.ones_like(values["mask"])
+        level = self.level
         on = np.flatnonzero(~values["terminated"])
         if len(on):
             seen = values["next_obs"][on]
@@ -208,7 +226,8 @@ class OpenCalls:
         for name, value in values.items():
             found[name] = np.zeros((height, n, *value.shape[1:]), value.dtype)
             found[name][place, env] = value
-        memory, starts = found.pop("recurrent_state", None), found.pop("episode_start")
+        memory = found.pop("recurrent_state", None)
+        starts = found.pop("episode_start")
         valid = np.arange(height)[:, None] < count
         return Batch(
             **found,

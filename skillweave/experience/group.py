@@ -29,7 +29,8 @@ class Collectors:
     """
 
     def __init__(self, parts: Sequence[Collector], members: int = 1) -> None:
-        self.parts, self.members = list(parts), members
+        self.parts = list(parts)
+        self.members = members
         self.num_envs = sum(part.num_envs for part in parts)
         self.steps_made = 0
         """Environment steps that were made together."""

@@ -87,7 +87,9 @@ class OneLearner:
     """
 
     def __init__(self, who: Alone, engine: Engine, acting: Acting | None) -> None:
-        self._acting, self._part, self._goals = acting, who.part, goals_of(who.skill)
+        self._acting = acting
+        self._part = who.part
+        self._goals = goals_of(who.skill)
         self._space = engine.action_space if who.part is None else who.part.action_space
         leaf = RowPolicy() if acting is None else Learning(acting, "")
         space = engine.action_space
@@ -97,7 +99,8 @@ class OneLearner:
         self.kept: dict[str, Array] = {}
         self.values: dict[str, Any] = {}
         self.seen_goals: dict[str, Goals] = {}
-        self.whole, self.overrides = True, bool(who.reflexes)
+        self.whole = True
+        self.overrides = bool(who.reflexes)
 
     def begin(self, request: Request, elapsed: Array) -> None:
         """Act by this request from now on; ``elapsed`` (N,) are steps of calls so far."""
@@ -154,7 +157,8 @@ class LevelLearners:
         margins: Mapping[str, float] | None,
         shaped: dict[str, Array],
     ) -> None:
-        self._acting, self._together = acting, learners is not None
+        self._acting = acting
+        self._together = learners is not None
         self._space, skills = engine.action_space, who.skills
         if learners is not None:
             skills = with_learners(skills, learners, margins or {})
@@ -230,7 +234,9 @@ class LevelLearners:
             whole: steps are recorded as a whole; else only where a selector decides and calls end.
         """
         for level in self.levels:
-            path, memory, guide = level.path, level.memory, level.hierarchy.guide
+            path = level.path
+            memory = level.memory
+            guide = level.hierarchy.guide
             call_end = memory["end"]
             if level is self.root:
                 call_end = call_end.copy()
@@ -261,7 +267,8 @@ class LevelLearners:
 
     def log(self, trace: Trace, info: Sequence[str]) -> Batch:
         """Return the steps with what calls did in them; ``info`` are keys that are logged."""
-        over, skills = trace["call_end"] != RUNNING, self.root.skills
+        over = trace["call_end"] != RUNNING
+        skills = self.root.skills
         goals = (f"{skill.name}/goal" for skill in skills)
         columns = {name: trace[name] for name in (*CALLS, *goals) if name in trace}
         columns["call_succeeded"] = call_successes(trace, skills, "", over)
@@ -295,7 +302,8 @@ class LevelLearners:
     @staticmethod
     def _of_critic(trace: Trace, level: LearningLevel, steps: Batch) -> Batch:
         """Return all steps of a level, for its critic."""
-        acts, running = steps["valid"], trace[level.path + "skill"]
+        acts = steps["valid"]
+        running = trace[level.path + "skill"]
         seen = {name: level.seen(trace, name) for name in ("obs", "next_obs")}
         if own := level.hierarchy.goals:
             names = ((i, f"{level.path}{level.skills[i].name}/goal") for i in own)
@@ -314,8 +322,11 @@ class LevelLearners:
         self, trace: Trace, level: LearningLevel, i: int, acts: Array, end: Array
     ) -> Batch:
         """Return what a skill that learns did, judged by its own reward and ends."""
-        skill, part, goals = level.skills[i], level.skill_set.part(i), level.hierarchy.goals.get(i)
-        path, own = level.path + skill.name, OwnSteps.called(trace, level.path, skill, acts)
+        skill = level.skills[i]
+        part = level.skill_set.part(i)
+        goals = level.hierarchy.goals.get(i)
+        path = level.path + skill.name
+        own = OwnSteps.called(trace, level.path, skill, acts)
         steps = own.rows(end)
         # Elsewhere it is called again at once.
         ends = trace.ended | own.timed_out
@@ -332,8 +343,11 @@ class LevelLearners:
         trace: Trace, level: LearningLevel, i: int, acts: Array, end: Array
     ) -> tuple[LearningLevel, Batch, Array, Array]:
         """Judge a skill that is a hierarchy; return the arguments of ``_of_level`` for it."""
-        below, own = level.below[i], OwnSteps.called(trace, level.path, level.skills[i], acts)
-        steps, over, ended = own.rows(end), trace.ended, trace[below.path + "call_end"]
+        below = level.below[i]
+        own = OwnSteps.called(trace, level.path, level.skills[i], acts)
+        steps = own.rows(end)
+        over = trace.ended
+        ended = trace[below.path + "call_end"]
         closes = (ended != RUNNING) | over | (steps["truncated"] & own.timed_out)
         if own.goal is not None:  # in its next call it decides again
             closes |= end != RUNNING

@@ -65,7 +65,8 @@ def with_learners(
         return UntrainedHierarchy(below, selector, policy.guide, goals_of(skill))
 
     pairs = zip(skills.skills, skills.policies, strict=True)
-    critic, interruption = path + CRITIC, None
+    critic = path + CRITIC
+    interruption = None
     if critic in margins:
         interruption = Interruption(_worth(learners[critic]), margins[critic])
     policies = tuple(policy_of(*pair) for pair in pairs)
@@ -132,7 +133,8 @@ class LearningLevel:
         for i, (skill, policy) in enumerate(zip(self.skills, self.skill_set.policies, strict=True)):
             path = f"{self.path}{skill.name}/"
             if any(name.startswith(path) for name in self.learners):
-                inside, memory = within(self.hierarchy.skills[i].policy), self.memory[str(i)]
+                inside = within(self.hierarchy.skills[i].policy)
+                memory = self.memory[str(i)]
                 found[i] = LearningLevel(policy.skills, inside, memory, self.learners, skill, path)
         return found
 

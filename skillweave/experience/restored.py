@@ -84,10 +84,12 @@ def opened(
     Raises:
         ValueError: it is not of these environments.
     """
-    found, plain = {}, obs_codec(observation_space)
+    found = {}
+    plain = obs_codec(observation_space)
     for name, value in open_calls.items():
         if name_of(name) == "obs":  # of a hierarchy below: "inner/obs"
-            like, codec = obs, plain
+            like = obs
+            codec = plain
             if (own := goals.get(name)) is not None:
                 like = own.join(obs, own.start(len(obs)))
                 codec = obs_codec(with_goal(observation_space, own.goal_space))

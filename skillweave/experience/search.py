@@ -85,7 +85,9 @@ class Search:
 
     def __init__(self, skill: Skill, starts: Starts, engine: Engine) -> None:
         n = engine.num_envs
-        self.skill, self.starts, self._space = skill, starts, engine.action_space
+        self.skill = skill
+        self.starts = starts
+        self._space = engine.action_space
         self._restricted = skill.defines("initiation")
         self._named = starts.named
         self._is_named = np.array([name in starts.after for name in starts.names], bool)
@@ -120,7 +122,8 @@ class Search:
 
         Where a call of it is to start, how many calls of others come first is drawn.
         """
-        ids, rng = np.flatnonzero(self.kept["calls_left"] < 0), world.rng
+        ids = np.flatnonzero(self.kept["calls_left"] < 0)
+        rng = world.rng
         if len(ids):
             assert rng is not None
             left = rng.integers(self.starts.calls + 1, size=len(ids))
@@ -141,7 +144,8 @@ class Search:
             return random_actions(self._space, len(ids), rng, allowed_rows(mask, ids))
         self._call(ids[~self._runs(ids)], obs, rng)
         runs = self._runs(ids)
-        called, free = ids[runs], ids[~runs]
+        called = ids[runs]
+        free = ids[~runs]
         action: Array = np.zeros((len(ids), *obs_shape(self._space)), obs_dtype(self._space))
         if len(called):
             turn = Turn(world, allowed_rows(mask, called))
@@ -160,11 +164,14 @@ class Search:
         Raises:
             TrainingError: nothing is ever found.
         """
-        left, last = self.kept["calls_left"], self._last(ids)
-        is_named, free = np.zeros(len(ids), bool), ids
+        left = self.kept["calls_left"]
+        last = self._last(ids)
+        is_named = np.zeros(len(ids), bool)
+        free = ids
         if self.starts.skills is not None:
             runs = self._runs(ids)
-            called, rows = ids[runs], np.flatnonzero(runs)
+            called = ids[runs]
+            rows = np.flatnonzero(runs)
             is_named[rows] = self._is_named[self.memory["skill"][called]]
             if len(called):
                 part = part_of(step, step.elapsed[called], called)
@@ -238,7 +245,8 @@ class Search:
         chance = np.where(may, rng.random(may.shape), -1.0)
         some = may.any(axis=1)
         choice = chance[some].argmax(axis=1)
-        here, skill = obs[ids[some]], self._hierarchy.skill_of(choice)
+        here = obs[ids[some]]
+        skill = self._hierarchy.skill_of(choice)
         found = dict[int, Array]()
         for i, goals in self._hierarchy.goals.items():
             mine = np.flatnonzero(skill == i)
@@ -261,7 +269,8 @@ class Search:
         holds = np.ones(len(ids), bool)
         if self._restricted:
             holds = asked(self.skill, "initiation", obs[ids], ids)
-        found, waiting = ids[holds & (self.kept["calls_left"][ids] == 0)], ids[~holds]
+        found = ids[holds & (self.kept["calls_left"][ids] == 0)]
+        waiting = ids[~holds]
         self.kept["searching"][found] = False
         self.kept["searched"][found] = 0
         self.kept["found"][found] = True

@@ -129,8 +129,10 @@ class OwnSteps:
 
     def _answers(self, skill: Skill, what: str, part: slice) -> Array:
         """Return what a skill answers in the rows ``part``, (K,) by time."""
-        acts, infos = self.acts[part], self.trace.infos[part]
-        every, steps = acts.all(), np.flatnonzero(acts.any(axis=1)).tolist()
+        acts = self.acts[part]
+        infos = self.trace.infos[part]
+        every = acts.all()
+        steps = np.flatnonzero(acts.any(axis=1)).tolist()
 
         def flat(x: Array) -> Array:
             x = x[part]
@@ -138,7 +140,8 @@ class OwnSteps:
 
         if len(steps) > 1:
             info = JointInfo([infos[t] for t in steps] if infos else [], acts[steps])
-            elapsed, goal = flat(self.elapsed), None if self.goal is None else flat(self.goal)
+            elapsed = flat(self.elapsed)
+            goal = None if self.goal is None else flat(self.goal)
             step = _step({name: flat(self.trace[name]) for name in OF_STEP}, elapsed, info)
             seen = seen_by(skill, step, elapsed, goal=goal)
             try:
@@ -156,7 +159,8 @@ class OwnSteps:
 
     def _alone(self, skill: Skill, t: int, ids: Array) -> Step:
         """Return step ``t`` of environments ``ids`` (k,), as the skill sees it."""
-        infos, columns = self.trace.infos, {name: self.trace[name][t] for name in OF_STEP}
+        infos = self.trace.infos
+        columns = {name: self.trace[name][t] for name in OF_STEP}
         step = _step(columns, self.elapsed[t], infos[t] if infos else {})
         goal = None if self.goal is None else self.goal[t, ids]
         return seen_by(skill, step, self.elapsed[t, ids], ids, goal)
@@ -248,7 +252,9 @@ class JointInfo(Mapping[str, Any]):
     def __init__(
         self, infos: Sequence[Mapping[str, Any]], acts: Array, whole: JointInfo | None = None
     ) -> None:
-        self._infos, self._acts, self._whole = infos, acts, whole
+        self._infos = infos
+        self._acts = acts
+        self._whole = whole
         self.keys_so_far = getattr(infos[0], "keys_so_far", None) if infos else None
         self.mixed = False
         """A key was read that cannot be joined: it differs in its kind between steps."""
@@ -257,7 +263,8 @@ class JointInfo(Mapping[str, Any]):
         values = [info[key] for info in self._infos if key in info or isinstance(info, Infos)]
         if not values:
             raise KeyError(key)
-        first, envs = values[0], self._acts.shape[1]
+        first = values[0]
+        envs = self._acts.shape[1]
         if len(values) < len(self._infos):
             self._mix()
         elif all(isinstance(v, dict) for v in values):

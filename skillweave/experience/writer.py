@@ -26,7 +26,8 @@ class TraceWriter:
     """
 
     def __init__(self, rows: int, num_envs: int, *, keep_infos: bool = False) -> None:
-        self._lead, self._columns = (rows, num_envs), dict[str, Array]()
+        self._lead = (rows, num_envs)
+        self._columns = dict[str, Array]()
         self._infos: list[Mapping[str, Any]] | None = [] if keep_infos else None
         self.row = 0
         """The row that is written."""
@@ -47,7 +48,8 @@ class TraceWriter:
         """Return a column, (T, N, …), of the shape and type of ``like`` (k, …) if it is new."""
         values = self._columns.get(name)
         if values is None:
-            shape, fill = (*self._lead, *like.shape[1:]), column(name).fill
+            shape = (*self._lead, *like.shape[1:])
+            fill = column(name).fill
             values = np.full(shape, fill, like.dtype) if fill else np.zeros(shape, like.dtype)
             self._columns[name] = values
         return values

@@ -61,7 +61,8 @@ def _with_file(
     policy: Mapped, space: gym.Space[Any], content: bytes, state: tuple[tuple[str, str], ...] = ()
 ) -> Mapped:
     """Return a policy whose model is a file that was traced on ``_examples``."""
-    inputs, leaves = policy.inputs, space_of(space).leaves
+    inputs = policy.inputs
+    leaves = space_of(space).leaves
     if inputs is None and () not in leaves:
         whole = {path: Take("observation", leaf.shape, path, whole=True)
                  for path, leaf in leaves.items()}  # fmt: skip

@@ -130,7 +130,8 @@ def in_env_units(algorithm: Algorithm, action: Tensor) -> Tensor:
     One with parts, or a choice of a skill with its goal, becomes a row of numbers (see
     ``Space.flat``).
     """
-    codec, head = algorithm.codec, getattr(algorithm, "head", None)
+    codec = algorithm.codec
+    head = getattr(algorithm, "head", None)
     if isinstance(codec, NumberedChoiceCodec):
         space: Any = codec.space
         return torch.from_numpy(space.rows(codec.table))[action]

@@ -72,7 +72,8 @@ class Exported(Functional, Foreign):
         spaces = gym_space(deployed.sees), gym_space(deployed.acts)
         Foreign.__init__(self, str(folder), *spaces)
         Functional.__init__(self, deployed.policy, *spaces)
-        self._archive, self._code = archive, code
+        self._archive = archive
+        self._code = code
 
     @property
     def _goal_places(self) -> list[Take]:
@@ -116,7 +117,8 @@ class Exported(Functional, Foreign):
         bound = self.bind(observation_space, action_space, who)
         check_range(goals, self._goal_places, bound._who)
         bound = bound._aiming(goal=None, goal_space=goals.space)
-        bound.joins, bound.observation_space = True, with_goal(observation_space, goals.goal_space)
+        bound.joins = True
+        bound.observation_space = with_goal(observation_space, goals.goal_space)
         return bound
 
     def _aiming(self, **goal: Any) -> Self:

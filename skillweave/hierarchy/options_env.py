@@ -60,7 +60,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._gamma = float(gamma)
         self._policy = acting_policy(skills)
-        self._hierarchy, self._all = within(self._policy), np.arange(engine.num_envs)
+        self._hierarchy = within(self._policy)
+        self._all = np.arange(engine.num_envs)
         self._seed = seed
         self._obs: Array = np.empty(0)
         self._mask: Array | None = None
@@ -219,7 +220,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
 
     def _checked(self, actions: Any) -> Array:
         """Return the numbers of skills (N,)."""
-        skill, count = np.asarray(actions), self.skills.choices
+        skill = np.asarray(actions)
+        count = self.skills.choices
         if skill.size != self.num_envs or skill.dtype.kind not in "iu":
             raise DeclarationError(
                 f"OptionsEnv.step: the skills are {short(actions)}; they must be a whole number "

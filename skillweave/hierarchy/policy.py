@@ -41,7 +41,8 @@ class HierarchyPolicy(Functional):
         guide: ActiveGuide | None = None,
         goals: Goals | None = None,
     ) -> None:
-        acting, joins = acting_policy(skills, selector, guide, goals), goals is not None
+        acting = acting_policy(skills, selector, guide, goals)
+        joins = goals is not None
         super().__init__(acting, selector.observation_space, skills.action_space, joins=joins)
         self.goals = goals
         self.selector = selector
@@ -93,7 +94,8 @@ class HierarchyPolicy(Functional):
         """Return the path of the skill that acts in ``row`` of a ``memory``: ``inner/skill``."""
         memory = split(flat(memory))
         i = int(memory["skill"][row])
-        name, policy = self.labels[i], self.skills.policies[i]
+        name = self.labels[i]
+        policy = self.skills.policies[i]
         if not isinstance(policy, HierarchyPolicy):
             return name
         return f"{name}/{policy.acts(memory[str(i)], row)}"
@@ -146,7 +148,8 @@ class SkillAlone(Functional):
                 "out, or give the skill a goal_space"
             )
         alone = copy.copy(self)
-        alone._goal, alone._gives = self.goals.one(goal, who), who
+        alone._goal = self.goals.one(goal, who)
+        alone._gives = who
         return alone
 
     def goal_now(self, memory: InPlaceMemory, row: int = 0) -> Array | None:

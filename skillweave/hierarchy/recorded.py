@@ -50,9 +50,13 @@ def level_entry(roles: Roles, level: Level) -> LevelEntry:
     Unless all its parts learn together in a stage, skills and selector are greedy by default.
     """
     together = any(map(roles.learns_together, roles.levels_to(level.path)))
-    selection, apart, calls = level.selection, level.apart, level.call_steps
+    selection = level.selection
+    apart = level.apart
+    calls = level.call_steps
     skills, selector = selection.greedy_skills, selection.greedy_selector
-    ready, guide, guiding = level.ready_selector, level.guide, level.ready_guide
+    ready = level.ready_selector
+    guide = level.guide
+    guiding = level.ready_guide
     guided = None
     if guide is not None and guiding is not None:
         guided = GuideEntry(source_of(guiding), guide.restrict, guide.target_kl)
@@ -119,7 +123,8 @@ def check_same_part(roles: Roles, entry: SkillEntry, where: str) -> None:
     path = entry.name
     declared = part_to_json(roles.skills[path], roles[path].rest, f"skill {path!r}")
     for field in ("sees", "acts", "rest", "residual"):
-        then, now = getattr(entry, field), declared.get(field)
+        then = getattr(entry, field)
+        now = declared.get(field)
         if then != now:
             raise RunError(
                 f"{where}: skill {path!r} was trained with {field} {shown(then)}, but now it is "

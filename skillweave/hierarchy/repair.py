@@ -92,8 +92,10 @@ def repair_stage(
         done: as for ``handover``.
     """
     path = repair.skill
-    level, role = roles.levels[level_of(path)], roles[path]
-    calls, config = level.apart.start_calls, role.config
+    level = roles.levels[level_of(path)]
+    role = roles[path]
+    calls = level.apart.start_calls
+    config = role.config
     assert config is not None
 
     def learning_task(policies: Policies) -> LearningTask:
@@ -102,7 +104,8 @@ def repair_stage(
         limit = whole.limit(list(level.skills).index(path))
         assert role.skill is not None
         holds = event_of(role.skill, done)
-        bonus, gamma = repair.bonus, float(config.gamma)
+        bonus = repair.bonus
+        gamma = float(config.gamma)
         learning = role
         if holds is not None and bonus:
             # As much as if a call that ends by the event went on, and the event held.
@@ -177,7 +180,8 @@ class PairChoice(RandomChoice):
 
     def __init__(self, skills: tuple[str, ...], lengths: int, skill: str, after: str) -> None:
         super().__init__(len(skills) * lengths)
-        self._lengths, self._skill = lengths, skills.index(skill)
+        self._lengths = lengths
+        self._skill = skills.index(skill)
         weights = np.where(np.array(skills) == after, 2.0, 1.0)
         weights[self._skill] = 0.0
         self._again = np.maximum(weights, 1e-6).repeat(lengths)
@@ -238,7 +242,10 @@ def measure(
     """
     names = tuple(s.name for s in skills.skills)
     number, first = names.index(skill), names.index(after)
-    matrix, parts, steps, may_start = None, list[CallLog](), 0, False
+    matrix = None
+    parts = list[CallLog]()
+    steps = 0
+    may_start = False
     rates: dict[bool, list[float]] = {True: [], False: []}
     tried = succeeded = 0  # calls of the other skill
     size = CHUNK
@@ -255,7 +262,8 @@ def measure(
         of_skill = log.skill == number
         won = calls_done(log, done)
         whole = (log.skill == first) & ~log.began_late
-        tried, succeeded = tried + int(whole.sum()), succeeded + int((whole & won).sum())
+        tried = tried + int(whole.sum())
+        succeeded = succeeded + int((whole & won).sum())
         for was_done, each in rates.items():
             some = of_skill & (won == was_done) & ~log.began_late
             each.extend((returns[some] / log.tau[some]).tolist())
@@ -326,7 +334,8 @@ def matrix_to_json(matrix: Handover) -> Matrix:
     """Return a matrix as a run records it."""
     calls, done, late = (x.tolist() for x in (matrix.calls, matrix.done, matrix.began_late))
     needed = None if matrix.needed is None else matrix.needed.tolist()
-    by_itself, limit = list(matrix.by_itself), matrix.time_limit
+    by_itself = list(matrix.by_itself)
+    limit = matrix.time_limit
     return Matrix(list(matrix.skills), calls, done, late, by_itself, limit, needed)
 
 
@@ -335,7 +344,8 @@ def matrix_from_json(entry: Matrix) -> Handover:
     columns = (entry.calls, entry.done, entry.began_late)
     calls, done, late = (np.array(x, np.int64) for x in columns)
     needed = None if entry.needed is None else np.array(entry.needed, np.int64)
-    by_itself, limit = tuple(entry.by_itself), entry.time_limit
+    by_itself = tuple(entry.by_itself)
+    limit = entry.time_limit
     return Handover(tuple(entry.skills), calls, done, late, by_itself, limit, needed)
 
 

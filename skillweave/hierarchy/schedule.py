@@ -262,7 +262,9 @@ def _apart(roles: Roles, level: Level, budgets: Mapping[str, int]) -> list[Stage
 
 def _skill_stage(roles: Roles, level: Level, path: str, budget: int) -> Stage:
     """Return the stage in which one skill of a level trains."""
-    role, apart, calls = roles[path], level.apart, level.apart.start_calls
+    role = roles[path]
+    apart = level.apart
+    calls = level.apart.start_calls
     assert role.config is not None
 
     def learning_task(policies: Policies) -> LearningTask:
@@ -284,7 +286,8 @@ def _skill_stage(roles: Roles, level: Level, path: str, budget: int) -> Stage:
 
 def _selector_stage(roles: Roles, level: Level, config: AlgorithmConfig, budget: int) -> Stage:
     """Return the stage in which the selector of a level trains over ready skills."""
-    role, interrupts = roles[level.selector_path], level.together.interrupt
+    role = roles[level.selector_path]
+    interrupts = level.together.interrupt
 
     def learning_task(policies: Policies) -> LearningTask:
         skills = level.skill_set({p: policy_at(roles, policies, p) for p in level.skills})

@@ -100,7 +100,8 @@ def _scores(
 ) -> dict[str, Evaluation]:
     """Return the evaluations of all candidates, by name."""
     entry = run.stage(join(level.path, TOGETHER))
-    spec, seed = roles.spec, SEEDS + run.manifest.seed
+    spec = roles.spec
+    seed = SEEDS + run.manifest.seed
     num_envs = entry.num_envs
     max_steps = None
     if not entry.final.get("length"):
@@ -139,8 +140,10 @@ def _best(scores: Mapping[str, Evaluation]) -> Candidate:
     """Return the candidate with the best mean; a selector samples only if it is clearly better."""
     by_mean: list[Any] = sorted(scores, key=lambda name: -scores[name].mean)  # of equals the first
     greedy: Candidate = next(k for k in by_mean if k == "before" or not SAMPLING[k][1])
-    first, other = scores[by_mean[0]], scores[greedy]
-    difference, error = first.mean - other.mean, standard_error(other.returns)
+    first = scores[by_mean[0]]
+    other = scores[greedy]
+    difference = first.mean - other.mean
+    error = standard_error(other.returns)
     return by_mean[0] if _is_clear(difference, first, error) else greedy
 
 

@@ -229,7 +229,8 @@ def check_parts(roles: Roles, policy: HierarchyPolicy, where: str) -> None:
     Selectors choose among their skills; all skills have the spaces of the first, or a part of the
     environment's. Without parts the environment is not needed.
     """
-    first, whole = policy.skills.policies[0], policy.skills.part(0)
+    first = policy.skills.policies[0]
+    whole = policy.skills.part(0)
     seen, acts = first.observation_space, policy.action_space
     if whole is not None:
         seen = whole.whole_observation_space

@@ -113,7 +113,9 @@ class ImageEncoder:
             for stage, out in enumerate(self.cnn.channels):
                 for part in ("in", "0.0", "0.1", "1.0", "1.1"):
                     self._layer(f"{stage}.{part}", channels if part == "in" else out, out, 3)
-                height, width, channels = (height + 1) // 2, (width + 1) // 2, out
+                height = (height + 1) // 2
+                width = (width + 1) // 2
+                channels = out
                 self.sizes.append((height, width))
         else:
             layers = zip(self.cnn.channels, self.cnn.kernels, self.cnn.strides, strict=True)

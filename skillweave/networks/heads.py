@@ -408,7 +408,9 @@ class JointHead:
         self, dist_params: Tensor, log_std: Tensor | None
     ) -> list[tuple[ActionHead | JointHead, Tensor, Tensor | None]]:
         """Return the head, parameters and log deviation of each part."""
-        found, start, first = [], 0, 0
+        found = []
+        start = 0
+        first = 0
         for head in self.heads:
             params = dist_params[..., start : start + head.width]
             std = None
@@ -494,7 +496,8 @@ class ChoiceHead(JointHead):
         of_choices = choice.kl(logits, None, other[..., : self.choices], None, mask)
         if other.shape[-1] == self.choices:
             return of_choices
-        share, total = mask_logits(logits, mask).softmax(-1), of_choices
+        share = mask_logits(logits, mask).softmax(-1)
+        total = of_choices
         for owner, mine, theirs in zip(
             self.codec.owners, goals, self._split(other, other_log_std)[1:], strict=True
         ):

@@ -92,12 +92,11 @@ class QNet:
         at = 0
         for layer in self._noisy:
             n_in, n_out = self.shapes[f"{layer}.weight"]
-            rows, columns = (
-                scaled[:, at : at + n_in, None],
-                scaled[:, None, at + n_in :][..., :n_out],
-            )
+            rows = scaled[:, at : at + n_in, None]
+            columns = scaled[:, None, at + n_in :][..., :n_out]
             at += n_in + n_out
             for kind, eps in (("weight", rows * columns), ("bias", columns)):
-                mean, sigma = views[f"{layer}.{kind}"], views[f"{layer}.{kind}_sigma"]
+                mean = views[f"{layer}.{kind}"]
+                sigma = views[f"{layer}.{kind}_sigma"]
                 weights[f"{layer}.{kind}"] = torch.addcmul(mean, sigma, eps)
         return weights

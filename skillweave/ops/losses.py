@@ -161,7 +161,9 @@ def categorical_projection(p: Tensor, atoms: Tensor, reward: Tensor, discount: T
     Returns:
         (P, B, N).
     """
-    low, high, width = atoms[0], atoms[-1], atoms[1] - atoms[0]
+    low = atoms[0]
+    high = atoms[-1]
+    width = atoms[1] - atoms[0]
     moved = (reward[..., None] + discount[..., None] * atoms).clamp(low, high)
     # Atom j's mass is split between the two atoms next to its new position: a triangle around each.
     share = (1.0 - (moved[..., None, :] - atoms[:, None]).abs() / width).clamp_min(0.0)

@@ -40,7 +40,8 @@ class Seen:
     def _ends(self) -> tuple[Tensor, Tensor]:
         width = BEYOND * (self.high - self.low)
         away = CLIP * scale_of(self.mean, self.var)
-        low, high = self.low - width, self.high + width
+        low = self.low - width
+        high = self.high + width
         return low.minimum(self.mean - away), high.maximum(self.mean + away)
 
     def look(self, numbers: Tensor) -> None:

@@ -79,7 +79,8 @@ class CallLog(LinkedCalls):
         Args:
             learning: allow a log in which skills learnt while their calls were recorded.
         """
-        names, lengths = tuple(s.name for s in skills.skills), skills.lengths
+        names = tuple(s.name for s in skills.skills)
+        lengths = skills.lengths
         if names != self.skills:
             raise RunError(
                 f"the log is of the skills {', '.join(self.skills)}, but these are "
@@ -245,7 +246,8 @@ def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:
     """
     found: list[tuple[int, ...] | None] = []
     for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True)):
-        part, places = skills.part(i), getattr(policy, "seen_places", None)
+        part = skills.part(i)
+        places = getattr(policy, "seen_places", None)
         if part is not None and (part.part.inputs is not None or part.base is not None):
             found.append(None if part.base is not None else _places_of_part(part))
             continue
@@ -267,7 +269,8 @@ def _places_of_part(part: OwnPart) -> tuple[int, ...] | None:
     codec = obs_codec(part.whole_observation_space)
     if not codec.images:
         return None
-    leaves, first = dict[str, range](), 0
+    leaves = dict[str, range]()
+    first = 0
     for leaf in codec.leaves:
         if leaf.image is None:
             leaves[leaf.name] = range(first, first + leaf.size)

@@ -175,7 +175,8 @@ class CallColumns(Choices):
         """The next call of the same episode, (C,) int64; −1: none was logged."""
         following = np.full(len(self), -1)
         rows = np.lexsort((self.order, self.episode))
-        a, b = rows[:-1], rows[1:]
+        a = rows[:-1]
+        b = rows[1:]
         joined = (self.episode[a] == self.episode[b]) & (self.order[a] + 1 == self.order[b])
         # In a nested hierarchy other skills may act between two of its calls.
         joined &= self.age[a] + self.tau[a] == self.age[b]
@@ -324,7 +325,9 @@ def columns_of(log: CallColumns) -> dict[str, Array]:
 
 def fields_of(columns: Mapping[str, Array]) -> dict[str, Any]:
     """Return the fields of a log whose ``columns_of`` these are."""
-    plain, info, goals = dict[str, Array](), dict[str, Array](), dict[str, Array]()
+    plain = dict[str, Array]()
+    info = dict[str, Array]()
+    goals = dict[str, Array]()
     for name, column in columns.items():
         if name.startswith(INFO):
             info[name.removeprefix(INFO)] = column

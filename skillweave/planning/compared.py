@@ -58,7 +58,8 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
         free = [place for place in np.flatnonzero(varies).tolist() if place not in fixed]
         if _reads_fixed(task, log) or _pays_by(task, log, after, free, fixed):
             fixed = []
-    start, end = before[log.offset[:-1]], after[log.offset[1:] - 1]
+    start = before[log.offset[:-1]]
+    end = after[log.offset[1:] - 1]
     places: list[Places] = []
     for skill, seen in enumerate(log.sees):
         if seen is None and codec.images:
@@ -90,7 +91,8 @@ def feature_maps(
         task: see ``compared_places``.
         skills: the places of those that are compared; None: all.
     """
-    places, names = compared_places(log, task), log.skills
+    places = compared_places(log, task)
+    names = log.skills
     features = log.features if features is None else features
     by_skill = features if isinstance(features, Mapping) else dict.fromkeys(names, features)
     for name in by_skill:

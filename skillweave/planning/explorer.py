@@ -57,7 +57,8 @@ class Explorer(RowPolicy):
         check_features(features, "Explorer")
         self.every = fitted(AtLeastOne, every, "Explorer: every")
         self._radius = fitted(Positive | None, radius, "Explorer: radius")
-        self._features, self._gamma = features, fitted(Fraction, gamma, "Explorer: gamma")
+        self._features = features
+        self._gamma = fitted(Fraction, gamma, "Explorer: gamma")
         self._neighbors = fitted(AtLeastOne, neighbors, "Explorer: neighbors")
         self._temperature = fitted(_Temperature, temperature, "Explorer: temperature")
         self._choices = 0
@@ -66,7 +67,8 @@ class Explorer(RowPolicy):
 
     def begin(self, choices: int) -> None:
         """Prepare for a recording; ``choices``: of a selector, skills times lengths."""
-        self._choices, self._graph = choices, None
+        self._choices = choices
+        self._graph = None
 
     def learn(self, log: CallLog) -> None:
         """Plan on the calls so far."""
@@ -80,7 +82,8 @@ class Explorer(RowPolicy):
             RewardMachine({}), self._gamma, graph.terminated, graph.after, graph.may,
             novel=self._far,
         )  # fmt: skip
-        self._graph, self._worth = graph, worth[:, 0]
+        self._graph = graph
+        self._worth = worth[:, 0]
 
     def new_share(self) -> float:
         """Return the share of (end of a call, choice) pairs that are new; 1 before planning."""
@@ -115,8 +118,10 @@ class Explorer(RowPolicy):
         score = q / (self._temperature * largest) + rng.gumbel(size=q.shape)
         if mask is not None:
             score = np.where(mask[:, graph.choice_of], score, -np.inf)
-        rows, option = np.arange(len(obs)), score.argmax(1)
-        choice, call = graph.choice_of[option], near.goal[rows, option]
+        rows = np.arange(len(obs))
+        option = score.argmax(1)
+        choice = graph.choice_of[option]
+        call = near.goal[rows, option]
         again = (call >= 0) & ~is_new[rows, option]
         goals = {}
         for name, numbers in graph.log.goals.items():

@@ -178,7 +178,8 @@ class _Calls:
         """Of each choice its pieces, where they start, and the usual distance of others."""
         for choice in range(log.choices):
             rows = np.flatnonzero((pieces.choice == choice) & some[pieces.call])
-            usual, points = 0.0, np.zeros((0, 1), np.float32)
+            usual = 0.0
+            points = np.zeros((0, 1), np.float32)
             if len(rows):
                 points = self._points(choice, starts[rows], pieces.call[rows])
                 few = points[evenly(np.arange(len(rows)), SAMPLED)]
@@ -242,11 +243,13 @@ def forecast(planner: Planner) -> Forecast:
     Raises:
         RunError: the log has no start of an episode.
     """
-    log, machine = planner.graph.log, planner.machine
+    log = planner.graph.log
+    machine = planner.machine
     starts = int((log.order == 0).sum())
     if not starts:
         raise RunError("the log has no start of an episode, so no plan can be judged by it")
-    rng, evidence = np.random.default_rng(0), ~log.began_late
+    rng = np.random.default_rng(0)
+    evidence = ~log.began_late
     whole = _follow(planner, planner.in_place, evidence, log.order == 0, rng)
     chance, reason = None, ""
     low, high = 0.0, 1.0
@@ -256,9 +259,13 @@ def forecast(planner: Planner) -> Forecast:
             chance, low, high = _without_luck(planner, (chance, low, high), rng)
         if planner.obstacle:
             low, high = (float(x) for x in wilson(0.0, min(EPISODES, starts)))
-            chance, reason = 0.0, planner.obstacle
+            chance = 0.0
+            reason = planner.obstacle
         elif chance is None or not whole.known.any():
-            chance, low, high, reason = None, 0.0, 1.0, _unknown(planner)
+            chance = None
+            low = 0.0
+            high = 1.0
+            reason = _unknown(planner)
         elif chance < UNLIKELY:
             known = read_log(machine, log)
             reason = _reason(machine, whole.last[~whole.done], log, known)
@@ -289,10 +296,12 @@ def played(expected: Forecast, done: int | None, episodes: int, steps: float) ->
         episodes: how many were played.
         steps: their mean steps.
     """
-    share, interval = None, (0.0, 1.0)
+    share = None
+    interval = (0.0, 1.0)
     if done is not None:
         low, high = wilson(done, episodes)
-        share, interval = done / episodes, (float(low), float(high))
+        share = done / episodes
+        interval = (float(low), float(high))
     return replace(
         expected, chance=share, interval=interval, steps=steps, unsure=(), reason="",
         episodes=episodes,
@@ -316,7 +325,8 @@ def _without_luck(
     number = np.unique(log.episode, return_inverse=True)[1].reshape(-1)
     if number.max() + 1 < FEWEST_EPISODES:
         return None, 0.0, 1.0
-    halves, first = [], log.order == 0
+    halves = []
+    first = log.order == 0
     for half in (number % 2 == 0, number % 2 == 1):
         acting = copy.copy(planner.in_place)
         acting.options = planner.graph.options.of_calls(half)
@@ -341,8 +351,11 @@ def _follow(
         first_of: (C,) bool, the calls in whose starts episodes start.
         rng: the source of chance.
     """
-    graph, machine, observed = planner.graph, planner.machine, planner.observed
-    log, calls = graph.log, _Calls(planner, some)
+    graph = planner.graph
+    machine = planner.machine
+    observed = planner.observed
+    log = graph.log
+    calls = _Calls(planner, some)
     starts = np.flatnonzero(first_of)
     n = EPISODES if observed is None else GOALS
     first = log.start[starts[np.arange(n) * len(starts) // n]]
@@ -350,8 +363,11 @@ def _follow(
     fixed = [(a == b).all(0) for a, b in zip(*map(leaves, (before, log.next_obs)), strict=True)]
     limit = planner.log.time_limit or np.inf
     known = read_log(machine, log)
-    obs, memory, elapsed = first.copy(), acting.start(n), np.zeros(n, np.int64)
-    may, running = np.ones((n, log.choices), bool), np.ones(n, bool)
+    obs = first.copy()
+    memory = acting.start(n)
+    elapsed = np.zeros(n, np.int64)
+    may = np.ones((n, log.choices), bool)
+    running = np.ones(n, bool)
     if graph.skills is not None:
         may = graph.skills.hierarchy.may_start(first)
     shape = (MOST_CALLS, n)
@@ -370,8 +386,10 @@ def _follow(
         may_here = may[here] | ~may[here].any(1, keepdims=True)
         history.state[number, here] = memory["state"][here]
         option, near = acting.decide(memory, here, obs[here], Turn(World(rng), may_here), True)
-        choice, aim = graph.choice_of[option], near.goal[np.arange(len(here)), option]
-        history.skill[number, here], history.aim[number, here] = log.skill_of(choice), aim
+        choice = graph.choice_of[option]
+        aim = near.goal[np.arange(len(here)), option]
+        history.skill[number, here] = log.skill_of(choice)
+        history.aim[number, here] = aim
         piece = np.full(len(here), -1)
         for one in np.unique(choice).tolist():
             mine = choice == one
@@ -382,8 +400,10 @@ def _follow(
         if not len(here):
             break
         history.call[number, here] = graph.pieces.call[piece]
-        step, end = graph.pieces.first[piece], graph.end_of[piece]
-        goes_on, skill = np.ones(len(here), bool), log.skill_of(choice)
+        step = graph.pieces.first[piece]
+        end = graph.end_of[piece]
+        goes_on = np.ones(len(here), bool)
+        skill = log.skill_of(choice)
         while goes_on.any():
             now, steps = here[goes_on], step[goes_on]
             readings = known.take(steps)
@@ -409,7 +429,8 @@ def _follow(
         if not running.any():
             break
     state = acting.state_of(memory, np.arange(n))
-    history.last, history.done = state[:, 0], machine.has_succeeded(state)
+    history.last = state[:, 0]
+    history.done = machine.has_succeeded(state)
     return history
 
 
@@ -432,7 +453,8 @@ def _shift(planner: Planner, skill: Array, one: Array, other: Array) -> Array:
     """Return the distances (n,) between observations, as the skills of calls see them."""
     shift = np.zeros(len(skill))
     for i in np.unique(skill):
-        mine, features = skill == i, planner.graph.maps[i]
+        mine = skill == i
+        features = planner.graph.maps[i]
         shift[mine] = np.linalg.norm(features(one[mine]) - features(other[mine]), axis=1)
     return shift
 

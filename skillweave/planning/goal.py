@@ -60,7 +60,8 @@ class GoalTask:
             )
         if (goal is None) == (columns is None):
             raise DeclarationError("a GoalTask needs either goal= or columns=")
-        self.reached, self.columns = reached, columns
+        self.reached = reached
+        self.columns = columns
         self.goal = None if goal is None else _goal(goal)
         # A slice or a list: both are indices of an axis.
         self._at: Any = list(columns) if isinstance(columns, tuple | list) else columns

@@ -119,7 +119,9 @@ class CallGraph:
                 "distances"
             )
             log = log.take(evenly(np.arange(len(log)), MOST_CALLS))
-        self.log, self.neighbors, self.skills = log, neighbors, skills
+        self.log = log
+        self.neighbors = neighbors
+        self.skills = skills
         self.pieces = pieces = _pieces(log, skills)
         known = np.concatenate([log.start, log.end])
         self.maps = [*feature_maps(log, features, known, task).values()]
@@ -174,15 +176,21 @@ class CallGraph:
         """
         for choice in range(self.log.choices):
             skill = self.log.skill_of(choice)
-            own, rows = aims[skill], np.flatnonzero(self.pieces.choice == choice)
+            own = aims[skill]
+            rows = np.flatnonzero(self.pieces.choice == choice)
             call = self.pieces.call[rows]
             features = self.maps[skill](starts[rows]) if len(rows) else np.zeros((0, 1), np.float32)
-            which, one, count = np.zeros(len(rows), np.int64), np.array([-1]), 1
+            which = np.zeros(len(rows), np.int64)
+            one = np.array([-1])
+            count = 1
             if own is not None and len(rows):
                 _, one, which = np.unique(own[call], axis=0, return_index=True, return_inverse=True)
-                one, which = call[one], which.reshape(-1)
+                one = call[one]
+                which = which.reshape(-1)
                 if not are_apart(len(one), len(np.unique(call))):
-                    one, which, count = np.array([-1]), np.zeros_like(which), CANDIDATES
+                    one = np.array([-1])
+                    which = np.zeros_like(which)
+                    count = CANDIDATES
             for i, goal in enumerate(one):
                 alike = np.flatnonzero(which == i)
                 mine = alike[tie_order(len(alike))]
@@ -271,7 +279,8 @@ class CallGraph:
                     q = np.where((near.distance[:, c] > novel[c])[:, None], np.float32(1.0), q)
                 np.maximum(best, q, out=best, where=allowed[:, c, None])
             best[~np.isfinite(best)] = 0.0  # no choice may follow, or none that is known
-            change, largest = np.abs(best - value).max(initial=0.0), np.abs(best).max(initial=0.0)
+            change = np.abs(best - value).max(initial=0.0)
+            largest = np.abs(best).max(initial=0.0)
             value = best
             if change <= TOLERANCE * largest:
                 break
@@ -281,21 +290,26 @@ class CallGraph:
         self, task: RewardMachine, readings: Readings, gamma: float, over: Array
     ) -> Callable[[Array], Array]:
         """Return a function: of the ends' values (E, M) to the worth of pieces, (P, M) float32."""
-        states, steps = planning_states(task), self.pieces.stop - self.pieces.first
+        states = planning_states(task)
+        steps = self.pieces.stop - self.pieces.first
         # The longest come first, so that those which go on are always a part from the beginning.
         order = np.argsort(-steps, kind="stable")
-        first, lengths = self.pieces.first[order], steps[order]
+        first = self.pieces.first[order]
+        lengths = steps[order]
         state = np.repeat(exact_states(states)[None], len(order), 0)
         paid = np.zeros((len(order), states.count))
         for k in range(int(lengths[0])):
             m = int(np.searchsorted(-lengths, -k, side="left"))
             state[:m], now = task.acts.advance(state[:m], readings.take(first[:m] + k))
             paid[:m] += gamma**k * now
-        reward, final = np.empty(paid.shape, np.float32), np.empty_like(state)
-        reward[order], final[order] = paid, state
+        reward = np.empty(paid.shape, np.float32)
+        final = np.empty_like(state)
+        reward[order] = paid
+        final[order] = state
         follows, weights = states.corners(final)
         used = np.flatnonzero(weights.any((0, 1)))  # exact levels need one corner alone
-        follows, weights = follows[..., used].astype(np.int32), weights[..., used]
+        follows = follows[..., used].astype(np.int32)
+        weights = weights[..., used]
         discount = gamma ** steps.astype(np.float64)
         discount[self._last] *= ~over[self.end_of[self._last]]
         discounts: Array = discount.astype(np.float32)[:, None]
@@ -333,13 +347,15 @@ def are_apart(goals: int, calls: int) -> bool:
 
 def goal_standard(log: CallLog, skill: str) -> Standard | None:
     """Return the scale of a skill's goals by its calls; None: it has no goals, or no call."""
-    goals, mine = log.goals.get(skill), log.skill == log.number(skill)
+    goals = log.goals.get(skill)
+    mine = log.skill == log.number(skill)
     return None if goals is None or not mine.any() else Standard(goals[mine])
 
 
 def _standard_goals(log: CallLog, skill: str) -> Array | None:
     """Return the goals of all calls, standardised by those of a skill's calls, (C, G) float32."""
-    goals, mine = log.goals.get(skill), log.skill == log.number(skill)
+    goals = log.goals.get(skill)
+    mine = log.skill == log.number(skill)
     if goals is None:
         return None
     if (standard := goal_standard(log, skill)) is None:
@@ -369,7 +385,8 @@ def _beginnings(log: CallLog, skills: SkillSet | None) -> Pieces:
     A beginning counts only where it is known what may follow.
     """
     parts = [(np.arange(len(log)), log.tau, log.choice)]
-    count, length = len(log.lengths), log.choice % len(log.lengths)
+    count = len(log.lengths)
+    length = log.choice % len(log.lengths)
     if skills is not None or log.may_follow.all():
         for i, steps in enumerate(log.lengths):
             longer = np.flatnonzero(length > i)
@@ -395,7 +412,8 @@ def planning_states(task: RewardMachine) -> Levels:
             f"at most {MOST_COUNTERS} can be planned"
         )
     used = task.counter_steps < np.iinfo(np.int64).max
-    steps, most = np.where(used, task.counter_steps, 1), LEVELS
+    steps = np.where(used, task.counter_steps, 1)
+    most = LEVELS
     while most > FEWEST_LEVELS and np.minimum(steps, most).prod(1).sum() > ENOUGH_STATES:
         most //= 2
     levels = np.minimum(steps, most)

@@ -158,7 +158,8 @@ class Handover:
 
     def weak_sentences(self, least: int = FEW) -> list[str]:
         """Return the sentences of ``weakest`` on the places of ``weak``."""
-        never, (calls, done) = self._never(least), self._elsewhere
+        never = self._never(least)
+        (calls, done) = self._elsewhere
         sentences = [
             f"{skill!r} succeeds in {shown_rate(0, count)}, whatever came before"
             for skill, count, none in zip(self.skills, self.calls.sum(0), never, strict=True)
@@ -167,7 +168,8 @@ class Handover:
         for i, j in self.weak(least):
             if never[j]:
                 continue
-            skill, elsewhere = self.skills[j], shown_rate(done[i, j], calls[i, j])
+            skill = self.skills[j]
+            elsewhere = shown_rate(done[i, j], calls[i, j])
             does = "ends by itself" if skill in self.by_itself else "succeeds"
             where = "at the start of an episode" if i == 0 else f"after {self.before[i]!r}"
             here = shown_rate(self.done[i, j], self.calls[i, j])
@@ -272,7 +274,8 @@ class Handover:
     @property
     def left_out(self) -> str:
         """Sentences on calls that began too late, or were cut otherwise; empty: there were none."""
-        late, sentences = int(self.began_late.sum()), []
+        late = int(self.began_late.sum())
+        sentences = []
         if late:
             few = self._lacks_time
             more = f". Some pairs have few calls left; {self._more_time(few)}" if few.any() else ""
@@ -369,8 +372,11 @@ def pair_counts(
         counts: (C,) bool, the calls that are counted; None: all.
     """
     if counts is not None:
-        before, skill, won = before[counts], skill[counts], won[counts]
-    place, shape = before * count + skill, (count + 1, count)
+        before = before[counts]
+        skill = skill[counts]
+        won = won[counts]
+    place = before * count + skill
+    shape = (count + 1, count)
     calls, done = (np.bincount(x, minlength=np.prod(shape)) for x in (place, place[won]))
     return calls.reshape(shape), done.reshape(shape)
 
@@ -703,7 +709,8 @@ def _largest_difference(
     """
     if not changes.any():
         return None, (float("nan"), float("nan"))
-    one, other = vector[best].mean(0), vector[~best].mean(0)
+    one = vector[best].mean(0)
+    other = vector[~best].mean(0)
     standard = Standard(vector)
     size = np.abs(standard(one) - standard(other))
     place = int(np.where(changes, size, -1).argmax())
@@ -912,9 +919,11 @@ class LinkedCalls(CallColumns):
                 + "; record more calls, chosen at random"
             )
         others = np.flatnonzero(counts & (before >= 0) & (before != wanted))
-        nan, did = float("nan"), won[rows]
+        nan = float("nan")
+        did = won[rows]
         elsewhere = float(won[others].mean()) if len(others) else nan
-        reasons, rate = self.take(rows[~did]).reasons, float(did.mean())
+        reasons = self.take(rows[~did]).reasons
+        rate = float(did.mean())
         starts = self.flat(self.start)
         changes = np.ones(starts.shape[1], bool)
         if after != START:
@@ -938,7 +947,8 @@ class LinkedCalls(CallColumns):
         )
         best = np.zeros(len(rows), bool)
         best[np.argsort(-score, kind="stable")[: _third(len(rows))]] = True
-        good, bad = float(did[best].mean()), float(did[~best].mean())
+        good = float(did[best].mean())
+        bad = float(did[~best].mean())
         as_elsewhere = rate if np.isnan(elsewhere) else elsewhere
         low, _ = wilson(did[best].sum(), best.sum())
         _, high = wilson(did[~best].sum(), (~best).sum())
@@ -987,10 +997,12 @@ class LinkedCalls(CallColumns):
             changes: (F,) bool, the numbers that the first skill changes.
         """
         of_skill = (before >= 0) & (self.skill == number)
-        high, works = wilson(won[rows].sum(), len(rows))[1], list[tuple[str, int, int]]()
+        high = wilson(won[rows].sum(), len(rows))[1]
+        works = list[tuple[str, int, int]]()
         for row in np.unique(before[of_skill]).tolist():
             some = of_skill & (before == row)
-            done, calls = int(won[some].sum()), int(some.sum())
+            done = int(won[some].sum())
+            calls = int(some.sum())
             if wilson(done, calls)[0] > high:
                 works.append(((START, *self.skills)[row], done, calls))
         works.sort(key=lambda entry: -entry[1] / entry[2])

@@ -51,7 +51,8 @@ def check_possible(task: RewardMachine, readings: Readings, log: CallColumns) ->
     The error names the predicates that never hold, and the skill that comes nearest to one.
     """
     happens = readings.events.max(0, initial=False)
-    reached, queue = {task.acts.first}, [task.acts.first]
+    reached = {task.acts.first}
+    queue = [task.acts.first]
     missing: dict[str, Predicate] = {}
     pays = bool(task.acts.each.any() or task.acts.each_by.any())
     while queue:
@@ -79,7 +80,8 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
     """
     events = read_log(task, log)
     _, first, of = np.unique(events.events, axis=0, return_index=True, return_inverse=True)
-    count, of = len(first), of.reshape(-1)
+    count = len(first)
+    of = of.reshape(-1)
     joined = np.flatnonzero(log.followed_by >= 0)
     if not task.accepting.any() or not len(joined) or count * len(task.accepting) > MOST_PLACES:
         return ""
@@ -125,7 +127,9 @@ def asks_nothing(task: RewardMachine, log: CallColumns) -> str:
     fewest = _fewest_steps(task)
     if not len(step) or not fewest:
         return ""
-    state, going, last = task.start(len(step)), np.ones(len(step), bool), log.offset[1:] - 1
+    state = task.start(len(step))
+    going = np.ones(len(step), bool)
+    last = log.offset[1:] - 1
     held: dict[str, float] = {}
     for _ in range(fewest):
         for arrow in {a for q in np.unique(state[going, 0]) for a in task.leaving[int(q)]}:
@@ -172,7 +176,8 @@ def _momentary(arrow: Arrow) -> list[Predicate]:
 
 def _fewest_steps(task: RewardMachine) -> int:
     """Return the fewest steps in which a task can be done, one for each transition; 0: never."""
-    steps, reached = 0, {task.acts.first}
+    steps = 0
+    reached = {task.acts.first}
     while not task.accepting[list(reached)].any():
         further = {a.target for q in reached for a in task.leaving[q] if not task.failing[a.target]}
         if further <= reached:
@@ -212,12 +217,14 @@ def _nearest(predicate: Predicate, log: CallColumns) -> str:
         return ""
     standard = Standard(obs)
     wanted = standard(wanted)
-    step, least = 0, np.inf
+    step = 0
+    least = np.inf
     for first in range(0, len(obs), 4_096):  # so that no large array is made
         part = standard(obs[first : first + 4_096, None]) - wanted
         far = np.square(part).mean(2).min(1)
         if far.min() < least:
-            least, step = float(far.min()), first + int(far.argmin())
+            least = float(far.min())
+            step = first + int(far.argmin())
     name = log.skills[int(log.skill[log.owner[step]])]
     return f"{name!r} comes nearest, in observation {observed(obs[step])}"
 

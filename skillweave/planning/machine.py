@@ -120,7 +120,9 @@ class RewardMachine:
                 "choose one"
             )
         first = 0 if start is None else _number(start, named, "start")
-        over, arrows, slots = done | failed, list[Arrow](), dict[int, int]()
+        over = done | failed
+        arrows = list[Arrow]()
+        slots = dict[int, int]()
         for pair, value in transitions.items():
             origin, target = named[pair[0]], named[pair[1]]
             if origin in over:
@@ -169,7 +171,8 @@ class RewardMachine:
                 f"the task has {len(names):,} states; at most {MOST_STATES:,} are possible: "
                 "repeat it less often, or combine fewer sequences by 'and' or 'or'"
             )
-        self.state_names, self.arrows = names, arrows
+        self.state_names = names
+        self.arrows = arrows
         self.leaving: list[list[Arrow]] = [[] for _ in names]
         """The transitions from each state, in the order in which they are checked."""
         for arrow in arrows:
@@ -178,7 +181,8 @@ class RewardMachine:
         """Counters side by side."""
         self.events: list[Predicate] = []
         self.rewards: list[Callable[[Step], Any]] = []
-        count, most = len(names), max(1, *map(len, self.leaving))
+        count = len(names)
+        most = max(1, *map(len, self.leaving))
         atoms = max([1, *(len(arrow.events) for arrow in arrows)])
         if count * most * atoms > MOST_CELLS:
             raise DeclarationError(
@@ -189,14 +193,16 @@ class RewardMachine:
             for predicate in predicates_of(arrow):
                 self.number(predicate)
         # Two columns behind those of the events: one is never true, the other always.
-        never, always = len(self.events), len(self.events) + 1
+        never = len(self.events)
+        always = len(self.events) + 1
         counted = np.full((count, self.slots), never)
         self.counter_steps = np.full((count, self.slots), _NEVER)
         """Steps for which each counter must count, (Q, H); the largest number: it is not used."""
         each_atom = np.full((count, most, atoms), always)
         each_atom[:, :, 0] = never
         target = np.arange(count)[:, None].repeat(most, 1)
-        paid, paid_by = np.zeros((count, most)), np.zeros((count, most), np.int64)
+        paid = np.zeros((count, most))
+        paid_by = np.zeros((count, most), np.int64)
         keeps = np.zeros((count, most, self.slots), bool)
         for q, some in enumerate(self.leaving):
             for t, arrow in enumerate(some):
@@ -209,7 +215,8 @@ class RewardMachine:
                 target[q, t] = arrow.target
                 paid[q, t], paid_by[q, t] = self._reward(arrow.reward)
                 keeps[q, t, list(arrow.keeps)] = True
-        each, each_by = np.zeros(count), np.zeros(count, np.int64)
+        each = np.zeros(count)
+        each_by = np.zeros(count, np.int64)
         for q, reward in (each_step or {}).items():
             each[q], each_by[q] = self._reward(reward)
         events = [
@@ -352,7 +359,8 @@ class RewardMachine:
         for arrow in self.leaving[state]:
             if any(count + 1 < held.steps for held in _held(arrow)):
                 continue
-            target, holds = self.state_names[arrow.target], predicates_of(arrow)
+            target = self.state_names[arrow.target]
+            holds = predicates_of(arrow)
             for counter in counters:
                 goes_on = any(counter.slot == held.slot for held in self._counters(arrow.target))
                 if counter.slot in arrow.keeps and goes_on and count + 1 < counter.steps:

@@ -275,12 +275,14 @@ def compile_mission(
     legs: Part, avoid: Sequence[Predicate], repeat: int | None
 ) -> tuple[tuple[str, ...], list[Arrow], set[int], set[int]]:
     """Return the machine of a mission: its states, arrows, accepting and failing states."""
-    parts, again = _in_order(sequence([legs] * (repeat or 1))), repeat is None
+    parts = _in_order(sequence([legs] * (repeat or 1)))
+    again = repeat is None
     _check_successions(parts, again)
     fragment = _fragment(InOrder(parts))
     ends = [DONE] * (not again) + [FAILED] * bool(avoid)
     names = (*_unique(fragment.waits), *ends)
-    end, failed = fragment.end, len(names) - 1
+    end = fragment.end
+    failed = len(names) - 1
     arrows: list[Arrow] = []
     for state, leaving in enumerate(fragment.arrows):
         arrows += [Arrow(state, failed, (bad,)) for bad in avoid]
@@ -298,7 +300,8 @@ def _in_order(part: Part) -> tuple[Part, ...]:
 
 def _unique(waits: Sequence[str]) -> tuple[str, ...]:
     """Return names of states: what each waits for, with a number where two wait for the same."""
-    names, number = dict.fromkeys((DONE, FAILED)), dict.fromkeys(waits, 1)
+    names = dict.fromkeys((DONE, FAILED))
+    number = dict.fromkeys(waits, 1)
     for wait in waits:
         name = wait
         while name in names:
@@ -348,8 +351,11 @@ def _together(parts: Sequence[_Fragment], first_ends: bool) -> _Fragment:
     """Run fragments side by side, each with counters of its own, until one or all have ended."""
     offsets = [0, *itertools.accumulate(p.slots for p in parts)]
     start = (0,) * len(parts)
-    numbers, queue, leaving = {start: 0}, [start], list[list[tuple[tuple[int, ...], Arrow]]]()
-    count, is_over = 0, any if first_ends else all
+    numbers = {start: 0}
+    queue = [start]
+    leaving = list[list[tuple[tuple[int, ...], Arrow]]]()
+    count = 0
+    is_over = any if first_ends else all
     for places in queue:  # it grows
         count += prod(
             1 + len(p.arrows[at]) if at < p.end else 1 for at, p in zip(places, parts, strict=True)
@@ -389,7 +395,9 @@ def _joint_arrows(
     combined = [c for c in itertools.product(*choices) if any(a is not None for a in c)]
     combined.sort(key=lambda c: -sum(a is not None for a in c))
     for arrows in combined:
-        events, keeps, target = [], set[int](), []
+        events = []
+        keeps = set[int]()
+        target = []
         for i, (arrow, part) in enumerate(zip(arrows, parts, strict=True)):
             own = range(offsets[i], offsets[i] + part.slots)
             if arrow is None:
@@ -463,7 +471,8 @@ class _Token(NamedTuple):
 
 class _Parser:
     def __init__(self, text: str, predicates: Mapping[str, Event]) -> None:
-        self.text, self.predicates = fitted(str, text, "a mission"), predicates
+        self.text = fitted(str, text, "a mission")
+        self.predicates = predicates
         if len(text) > LONGEST:
             raise DeclarationError(f"a mission has {len(text):,} characters; at most {LONGEST:,}")
         for name in predicates:
@@ -513,7 +522,8 @@ class _Parser:
 
     def joined(self, word: str, parse: Callable[[], Part], most: str = "") -> list[Part]:
         """Parse parts with a word between them; ``most`` says that they are too many."""
-        first, parts = self.now, [parse()]
+        first = self.now
+        parts = [parse()]
         while self.takes(word):
             parts.append(parse())
         if most and len(parts) > MOST_TOGETHER:
@@ -611,7 +621,8 @@ class _Parser:
     def fail(self, reason: str, token: _Token | None = None) -> NoReturn:
         """Raise an error whose second line shows the text, and whose third points at a word."""
         token = token or self.now
-        shown, at = self.text.expandtabs(1), token.at
+        shown = self.text.expandtabs(1)
+        at = token.at
         # A window of the text, so that the pointer is below its word in any terminal.
         first = max(0, at - 50)
         line = " ".join(shown[first : at + 30].splitlines())
@@ -620,7 +631,8 @@ class _Parser:
 
     def _tokens(self) -> list[_Token]:
         tokens: list[_Token] = []
-        place, end = 0, len(self.text.rstrip())
+        place = 0
+        end = len(self.text.rstrip())
         while place < end:
             match = _TOKEN.match(self.text, place)
             if match is None:

@@ -91,7 +91,9 @@ class FeatureMap:
     """
 
     def __init__(self, space: gym.Space[Any], features: Any, known: Array, who: str) -> None:
-        self._space, self._features, self._who = space, features, who
+        self._space = space
+        self._features = features
+        self._who = who
         self._codec = None if callable(features) else obs_codec(space)
         self.places: list[int] | None = None
         """The places in the flat observation; None: the features are a function."""

@@ -167,10 +167,13 @@ class Planner(ReadySelector):
     @cached_property
     def in_place(self) -> Planned:  # type: ignore[override]
         """The plan as data, which acts in many environments at once."""
-        graph, states, worth = self.graph, self.states, self.plan
+        graph = self.graph
+        states = self.states
+        worth = self.plan
         kind: type[Planned] = Planned
         if self.observed is not None:
-            kind, worth = _OfObserved, np.zeros((len(graph.pieces.call), states.count), np.float32)
+            kind = _OfObserved
+            worth = np.zeros((len(graph.pieces.call), states.count), np.float32)
         acts = kind(
             *self._rule_of,
             tuple(each.acting for each in graph.maps),
@@ -257,7 +260,8 @@ class Planner(ReadySelector):
         goals = self.graph.log.goals.get(self.log.skills[skill])
         if goals is None or (calls < 0).any():
             return ""
-        mine, space = goals[calls], None
+        mine = goals[calls]
+        space = None
         if self.graph.skills is not None:
             space = self.graph.skills.skills[skill].goal_space
         if goals.shape[1] > MOST_SHOWN:

@@ -169,18 +169,22 @@ class WithDrawnGoals(Around):
 
     def __init__(self, selector: Any, skills: SkillSet, space: gym.Space[Any]) -> None:
         super().__init__(in_place(selector, "the selector's act()"))
-        self._selector, self._skills, self._space = selector, skills, space
+        self._selector = selector
+        self._skills = skills
+        self._space = space
         self._goals = goals_in(skills)
 
     def act(self, memory: InPlaceMemory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return choices (k,) with goals."""
-        rng, again = turn.world.rng, dict[str, tuple[Array, Array]]()
+        rng = turn.world.rng
+        again = dict[str, tuple[Array, Array]]()
         assert rng is not None
         if isinstance(self._selector, Explorer):
             number, again = self._selector.decide(obs, turn.mask, rng)
         else:
             number = super().act(memory, rows, obs, turn)
-        choice, skill = blank_choices(self._space, number), self._skills.skill_of(number)
+        choice = blank_choices(self._space, number)
+        skill = self._skills.skill_of(number)
         for i, (name, goals) in self._goals.items():
             mine = np.flatnonzero(skill == i)
             if len(mine):
@@ -192,7 +196,8 @@ class WithDrawnGoals(Around):
 
 
 def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
-    names, choices = tuple(s.name for s in skills.skills), skills.choice_space
+    names = tuple(s.name for s in skills.skills)
+    choices = skills.choice_space
     if isinstance(choose, Explorer):
         choose.begin(skills.choices)
     if isinstance(choose, RowPolicy):
@@ -233,7 +238,9 @@ def _play(
         seeds: receives the seeds of episodes as they start; −1: unknown, of EnvPool.
         stops: returns whether to stop at once.
     """
-    n, feed, goals = engine.num_envs, TraceFeed([recorder]), goals_in(recorder.skills)
+    n = engine.num_envs
+    feed = TraceFeed([recorder])
+    goals = goals_in(recorder.skills)
     started = np.zeros(n, np.int64)  # episodes of each environment
 
     def begin(rows: Array) -> Array:
@@ -247,9 +254,12 @@ def _play(
         seeds.extend([-1] * len(rows))
         return engine.reset(seed) if fresh else engine.reset_some(rows)
 
-    memory, obs = policy.start(n), np.array(begin(np.arange(n)))
+    memory = policy.start(n)
+    obs = np.array(begin(np.arange(n)))
     turn.world.age = age = np.zeros(n, np.int64)
-    rows, made, planned = np.arange(n), 0, 0
+    rows = np.arange(n)
+    made = 0
+    planned = 0
     try:
         while len(rows) and not stops():
             here = obs[rows]

@@ -110,10 +110,16 @@ class Recorder:
         steps: bool = True,
         spec: EnvSpec | None = None,
     ) -> None:
-        self.skills, self.spaces, self.info, self.latest = skills, spaces, tuple(info), latest
-        self.path, self._above = path, dict(above or {})
+        self.skills = skills
+        self.spaces = spaces
+        self.info = tuple(info)
+        self.latest = latest
+        self.path = path
+        self._above = dict(above or {})
         self._columns = f"{path}/" if path else ""
-        self._own_rewards, self._inside, self._keeps_steps = own_rewards, inside, steps
+        self._own_rewards = own_rewards
+        self._inside = inside
+        self._keeps_steps = steps
         self._environment = Texts() if spec is None else environment_texts(spec)
         self.goals: dict[str, Goals] = dict(goals_in(skills).values())
         """The goals of skills that have some, by name."""
@@ -130,7 +136,8 @@ class Recorder:
         self._latest = np.zeros(n, row)  # the latest call of each environment
         self._latest["number"] = -1
         self._open, self._won = np.zeros(n, bool), np.zeros(n, bool)  # it runs; success() is true
-        self._episode, self._count = np.full(n, -1), np.zeros(n, np.int64)
+        self._episode = np.full(n, -1)
+        self._count = np.zeros(n, np.int64)
         # The calls of an environment before its episode. Where that was open when the recording
         # began, its first calls are unknown, so the next one is number 1 in it.
         self._first = np.full(n, -1)
@@ -166,7 +173,9 @@ class Recorder:
             DeclarationError: the log would have more than 4 GiB.
         """
         ids = np.arange(len(self._open)) if ids is None else ids
-        acts, begins, k = self._acts(trace), trace["elapsed"] == 1, len(ids)
+        acts = self._acts(trace)
+        begins = trace["elapsed"] == 1
+        k = len(ids)
         starts = trace.get(self._columns + "call_start")
         if starts is None:
             starts = trace[self._columns + "call_elapsed"] == 1
@@ -193,7 +202,8 @@ class Recorder:
             self._judge(trace, mine, over, calls, at, ids)
         self._end(trace, over, calls, at[over])
         part = _Piece(self._calls, np.concatenate([ended, calls[at[over]]]), steps)
-        self._latest[ids], self._open[ids] = calls[at[-1]], mine[-1] & ~over[-1]
+        self._latest[ids] = calls[at[-1]]
+        self._open[ids] = mine[-1] & ~over[-1]
         self._calls += len(calls) - k
         infos = trace.infos[-1:] if isinstance(trace, Trace) else ()
         self._last = Trace(infos, {name: x[-1:].copy() for name, x in trace.items()}), ids
@@ -232,7 +242,9 @@ class Recorder:
         Args:
             learning: names of the skills that learnt meanwhile.
         """
-        rows, steps, skills = self.rows(), self._joined(), self.skills
+        rows = self.rows()
+        steps = self._joined()
+        skills = self.skills
         inside = np.flatnonzero(np.isin(steps["call"], rows["number"]))
         inside = inside[np.argsort(steps["call"][inside], kind="stable")]
         steps = {k: x[inside] if len(x) else x for k, x in steps.items() if k != "call"}
@@ -271,7 +283,8 @@ class Recorder:
             order: (T, k) int64, the numbers of their calls in these.
         """
         new = np.zeros(int(starts.sum()), self._latest.dtype)
-        new["number"], new["seed"] = self._calls + np.arange(len(new)), -1
+        new["number"] = self._calls + np.arange(len(new))
+        new["seed"] = -1
         new["choice"] = trace[self._columns + "skill"][starts]
         if lengths := self.skills.lengths:
             length = trace[self._columns + "call_length"][starts]
@@ -308,7 +321,8 @@ class Recorder:
         self, trace: Any, mine: Array, over: Array, calls: Array, at: Array, ids: Array
     ) -> None:
         """Judge the steps ``mine`` (T, k) bool by the skills, for ``SUMS``; see ``add``."""
-        skills, running = self.skills.skills, trace[self._columns + "skill"]
+        skills = self.skills.skills
+        running = trace[self._columns + "skill"]
         elapsed, end = (trace[f"{self._columns}call_{name}"] for name in ("elapsed", "end"))
         own = trace["env_reward"].astype(np.float64)
         np.add.at(calls["task_return"], at[mine], own[mine])
@@ -326,7 +340,8 @@ class Recorder:
             won = call_successes(trace, skills, self._columns, endless)
             before = np.concatenate([self._won[ids][None], won[:-1]])
             late = over & (end == LIMIT) & won & before & (elapsed > 1)
-            calls["late"][at[late]], self._won[ids] = True, won[-1]
+            calls["late"][at[late]] = True
+            self._won[ids] = won[-1]
 
     def _end(self, trace: Batch, over: Array, calls: Array, at: Array) -> None:
         """Write in ``calls``, rows ``at`` (K,), how those whose last steps are ``over`` ended."""
@@ -381,7 +396,8 @@ class TraceFeed:
         self.recorders = tuple(recorders)
         self._infos = any(recorder.reads_infos for recorder in recorders)
         self._each = _bytes_of(recorders[0].spaces[0])
-        self._ids, self._rows = np.zeros(0, np.int64), 0
+        self._ids = np.zeros(0, np.int64)
+        self._rows = 0
         self._out: TraceWriter | None = None
 
     def add(self, ids: Array, step: Step, levels: Mapping[str, Memory]) -> None:
@@ -411,8 +427,10 @@ class TraceFeed:
     def flush(self) -> None:
         """Let the recorders read the steps so far."""
         if self._out is not None:
-            trace, ids = self._out.trace(), self._ids
-            self._out, self._ids = None, ids[:0]
+            trace = self._out.trace()
+            ids = self._ids
+            self._out = None
+            self._ids = ids[:0]
             for recorder in self.recorders:
                 recorder.add(trace, ids)
 

@@ -87,14 +87,16 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env: gym.Env[Any, Any], task: Task, *, observe: bool = False) -> None:
         super().__init__(env)
         self.machine = task.at(None) if isinstance(task, GoalTask) else task
-        self._own, self._observes = env.observation_space, observe
+        self._own = env.observation_space
+        self._observes = observe
         if observe:
             self.observation_space = _with_task(self._own, self.machine.observation_space)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Reset the environment and the task."""
         obs, info = self.env.reset(seed=seed, options=options)
-        self._state, self._elapsed = self.machine.start(1), 0
+        self._state = self.machine.start(1)
+        self._elapsed = 0
         self._obs = _batch_of_one(self._own, obs)
         return self._seen(obs), info
 

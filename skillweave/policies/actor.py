@@ -52,7 +52,8 @@ class Actor:
         self._deployed = deployed
         self._deterministic = deterministic
         self._nan = nan
-        leaves, size = deployed.sees.leaves, sum(deployed.acts.counts)
+        leaves = deployed.sees.leaves
+        size = sum(deployed.acts.counts)
         self._real = [path for path, leaf in leaves.items() if leaf.record.kind == "f"]
         self._choices = {path: leaf for path, leaf in leaves.items() if leaf.kind != "Box"}
         """The parts of observations that are choices, which networks see one-hot."""
@@ -91,8 +92,10 @@ class Actor:
             DeclarationError: the observation or the mask does not fit the policy; the message
                 names what does.
         """
-        deployed, choices = self._deployed, self._deployed.acts.counts
-        seen, given = self._seen(obs), dict(info or {})
+        deployed = self._deployed
+        choices = self._deployed.acts.counts
+        seen = self._seen(obs)
+        given = dict(info or {})
         if choices and given.get(MASK) is not None:
             given[MASK] = self._allowed(given[MASK])[0]
         if self._before is not None:

@@ -234,7 +234,8 @@ class Reader:
 
     def _object(self, entry: dict[str, Any], where: str) -> Any:
         made: Any = kinds()[entry["type"]]
-        own, values = written_fields(made), dict[str, Any]()
+        own = written_fields(made)
+        values = dict[str, Any]()
         if wrong := [name for name in entry if name not in own and name != "type"]:
             near = get_close_matches(str(wrong[0])[:60], own, 1)
             hint = f": is {near[0]!r} meant?" if near else f"; there are: {', '.join(own)}"
@@ -373,7 +374,8 @@ def read_folder(
         RunError: a file is missing or damaged; the message names it and the field.
         PolicyError: it needs a function that was not given.
     """
-    folder, code = Path(path), dict(code or {})
+    folder = Path(path)
+    code = dict(code or {})
     file = folder / MANIFEST
     opened = _Folder(folder, archive)
     content = parse_json(opened.read(MANIFEST, LARGEST), file)

@@ -144,7 +144,9 @@ def _rows(value: Any, rows: Array, n: int) -> Any:
     return value[rows] if batched else value
 
 
-OWN_REWARD, OWN_SUCCESS, SUCCESS = "env_reward", "env_success", "success"
+OWN_REWARD = "env_reward"
+OWN_SUCCESS = "env_success"
+SUCCESS = "success"
 """Keys of info: the first two where a task gives the reward and says what success is."""
 
 

@@ -66,7 +66,8 @@ class Functional:
         memory, own = self._copied(memory)
         if self.joins:
             obs, goal = obs[OBSERVATION], obs[GOAL]
-        turn, rows = Turn(World(rng), mask, goal, deterministic), np.arange(len(obs))
+        turn = Turn(World(rng), mask, goal, deterministic)
+        rows = np.arange(len(obs))
         return self.in_place.act(own, rows, obs, turn), memory
 
     def observe(self, memory: Memory, step: Step) -> Memory:
@@ -153,7 +154,8 @@ class Returns(RowPolicy):
                 f"{sorted(self._names)}: return arrays of the same names"
             )
         for name, value in after.items():
-            old, new = memory[name], np.asarray(value)
+            old = memory[name]
+            new = np.asarray(value)
             fits = new.dtype == old.dtype or np.can_cast(new.dtype, old.dtype, "same_kind")
             if new.shape != (len(rows), *old.shape[1:]) or not fits:
                 raise PolicyError(

@@ -81,7 +81,8 @@ class CallGoals:
         Raises:
             SkillError: they have another shape or type, or are out of the space.
         """
-        n, skill = len(obs), f"skill {self.name!r}"
+        n = len(obs)
+        skill = f"skill {self.name!r}"
         goals = self.space.goals(goal, n, who, skill)
         if self.clip is not None:
             who = f"{skill}: clip_goal()"
@@ -276,13 +277,16 @@ class CallAndReturn(Choices, RowPolicy):
         if len(ended) == len(rows):
             self.begin(memory, rows, self._choice(memory, rows, obs, turn))
         elif len(ended):
-            at, part = rows[ended], turn.some(ended)
+            at = rows[ended]
+            part = turn.some(ended)
             self.begin(memory, at, self._choice(memory, at, obs[ended], part))
-        running, actions = memory["skill"][rows], None
+        running = memory["skill"][rows]
+        actions = None
         own = Turn(turn.world, turn.mask, None, self.greedy)
         for i, mine in _by_skill(running):
             every = len(mine) == len(rows)
-            part, at = own if every else own.some(mine), rows if every else rows[mine]
+            part = own if every else own.some(mine)
+            at = rows if every else rows[mine]
             part.goal = self.goal_of(memory, i, at)
             seen = obs if every else obs[mine]
             some = self.skills[i].policy.act(memory[str(i)], at, seen, part)
@@ -303,7 +307,9 @@ class CallAndReturn(Choices, RowPolicy):
         chooses again. Its last of ``tries`` counts; so does that of a selector that would choose
         the same again.
         """
-        world, selector, seen = turn.world, self.selector, obs
+        world = turn.world
+        selector = self.selector
+        seen = obs
         may = self.mask(obs, None if world.age is None else world.age[rows])
         assert selector is not None, "nothing chooses"
         if self.fresh_calls:
@@ -372,7 +378,9 @@ class CallAndReturn(Choices, RowPolicy):
         if self.lengths:
             memory["length"][rows] = np.array(self.lengths)[choice % self.each]
         fresh = (memory["skill"][rows] != skill) | self._fresh[skill]
-        memory["skill"][rows], memory["elapsed"][rows], memory["end"][rows] = skill, 0, RUNNING
+        memory["skill"][rows] = skill
+        memory["elapsed"][rows] = 0
+        memory["end"][rows] = RUNNING
         for i, own in enumerate(self.skills):
             if memory[str(i)] and len(mine := rows[fresh & (skill == i)]):
                 put(memory[str(i)], mine, own.policy.start(len(mine)))
@@ -465,7 +473,8 @@ class CallAndReturn(Choices, RowPolicy):
 
     def may_start(self, obs: Array) -> Array:
         """Return the choices whose skill may start, (k, choices); perhaps none somewhere."""
-        may, rows = np.empty((len(obs), len(self.skills)), bool), np.arange(len(obs))
+        may = np.empty((len(obs), len(self.skills)), bool)
+        rows = np.arange(len(obs))
         for i, skill in enumerate(self.skills):
             may[:, i] = skill.policy.startable(obs) if skill.policy.restricts else True
             if skill.initiation is not None:
@@ -485,7 +494,8 @@ class CallAndReturn(Choices, RowPolicy):
 
     def stuck(self, memory: Memory, rows: Array, obs: Array) -> Array:
         """(k,) bool, the selector must decide, but no skill may start; its own call ends there."""
-        stuck, end = np.zeros(len(rows), bool), memory["end"][rows]
+        stuck = np.zeros(len(rows), bool)
+        end = memory["end"][rows]
         waits = np.flatnonzero((end != RUNNING) & (end != EPISODE))
         if len(waits):
             stuck[waits] = ~self.startable(obs[waits])
@@ -527,7 +537,9 @@ class CallAndReturn(Choices, RowPolicy):
         for i, mine in _by_skill(running):
             if i not in self._asked:
                 continue
-            skill, at, part = self.skills[i], rows[mine], seen(i, mine)
+            skill = self.skills[i]
+            at = rows[mine]
+            part = seen(i, mine)
             if skill.policy.watches:
                 skill.policy.observe(memory[str(i)], at, part)
                 if skill.policy.restricts:
@@ -543,7 +555,8 @@ class CallAndReturn(Choices, RowPolicy):
         succeeded = end == OWN  # where the skill does not say it itself
         ended = np.flatnonzero(end != RUNNING)
         for i, mine in _by_skill(running[ended]):
-            skill, over = self.skills[i], ended[mine]
+            skill = self.skills[i]
+            over = ended[mine]
             if skill.success is not None:
                 part = seen(i, over)
                 succeeded[over] = self.ask(skill.success, part, rows[over], skill.path, "success")
@@ -560,8 +573,11 @@ class CallAndReturn(Choices, RowPolicy):
         mine = np.flatnonzero(end == RUNNING)
         if not len(mine):
             return
-        rows, obs, n = rows[mine], step.next_obs[mine], len(self.skills)
-        running, seen = memory["skill"][rows], obs
+        rows = rows[mine]
+        obs = step.next_obs[mine]
+        n = len(self.skills)
+        running = memory["skill"][rows]
+        seen = obs
         if self.fresh_calls:
             seen = joined(obs, step.goal[mine])
         if self.goals:
@@ -600,7 +616,8 @@ class CallAndReturn(Choices, RowPolicy):
             self.guide.selector.check_skills(names, None, f"{where}.guide")
             self.guide.selector.check(seen, plain, None, f"{where}.guide")
         if self.interruption is not None and isinstance(self.interruption.worth, Critic):
-            least, most = np.asarray(-np.inf), np.asarray(np.inf)
+            least = np.asarray(-np.inf)
+            most = np.asarray(np.inf)
             worth = Space("Box", "float32", (len(self.skills) + 1,), least, most)
             seen = with_goal(seen, of) if spaces else seen
             self.interruption.worth.policy.check(seen, worth, None, f"{where}.critic")

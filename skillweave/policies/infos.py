@@ -31,7 +31,8 @@ class Infos(dict[str, Any]):
 
     def __init__(self, info: Mapping[str, Any], keys: InfoKeys, n: int) -> None:
         super().__init__(info)
-        self.keys_so_far, self.n = keys, n
+        self.keys_so_far = keys
+        self.n = n
 
     def __missing__(self, key: str) -> Any:
         return self.keys_so_far.missing(key, self.n)

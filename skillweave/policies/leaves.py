@@ -96,7 +96,8 @@ class Learning(RowPolicy):
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return actions (k, …) in the environment's units, as the latest request says."""
-        before, mask = memory["rnn"][rows] if "rnn" in memory else None, turn.mask
+        before = memory["rnn"][rows] if "rnn" in memory else None
+        mask = turn.mask
         acted = self.net.some(rows, obs, self.net.widened(mask), before)
         if acted.recurrent_state is not None:
             memory["rnn"][rows] = acted.recurrent_state
@@ -187,7 +188,8 @@ class OnnxNetwork(RowPolicy):
                         f"its file takes {_words(taken.get(name))} as {name!r}, but is given "
                         f"{_words(given.get(name))}"
                     )
-            rows, turn = np.zeros(1, np.int64), Turn(World(np.random.default_rng(0)))
+            rows = np.zeros(1, np.int64)
+            turn = Turn(World(np.random.default_rng(0)))
             action = tried._run(self.start(1), rows, self.sees.start(1), turn)
             size = self.acts.shape if self.acts.parts is None else (self.acts.size,)
             if action.shape != (1, *size):

@@ -86,7 +86,8 @@ class Take:
         self._places: Any = None
         if self.places is not None:
             check_places(self.places, numbers, "Take.places")
-            first, end = self.places[0], self.places[0] + self.size
+            first = self.places[0]
+            end = self.places[0] + self.size
             follow = self.places == tuple(range(first, end))  # then they are read without a copy
             self._places = slice(first, end) if follow else np.array(self.places)
         if self.whole and (self.choices or self.places is not None):
@@ -303,7 +304,8 @@ class Outputs:
         self.count = len(self.to)
         self._to = np.array(self.to)
         if not box:
-            self._chosen, self.choices = discrete(self.count), [self.count]
+            self._chosen = discrete(self.count)
+            self.choices = [self.count]
             return
         _check_sizes(self, (self.count,), "scale", "offset")
         if self.clip is not None and not self.clip[0] <= self.clip[1]:
@@ -387,13 +389,15 @@ class Outputs:
         numbers = output.reshape(n, self.count)
         if self.clip is not None:
             numbers = clipped(numbers, *self.clip)
-        space, full = self.space, numbers
+        space = self.space
+        full = numbers
         if self.scale is not None:
             full = full * self.scale
         if self.offset is not None:
             full = full + self.offset
         if self._rest is not None:
-            written, full = full, self._rest.repeat(n, axis=0)
+            written = full
+            full = self._rest.repeat(n, axis=0)
             full[:, self._to] = written
         full = full.reshape(n, *space.shape)
         if np.dtype(space.dtype).kind in "iu":
@@ -474,7 +478,8 @@ class Function(Model):
         given = {name: read_only(x) for name, x in inputs.items()}
         if self.takes_goal:
             assert turn.goal is not None
-            obs, goal = given[""], read_only(turn.goal)
+            obs = given[""]
+            goal = read_only(turn.goal)
             if self.takes_goal == "second":
                 return self.function(obs, goal), ()
             return self.function(obs, goal=goal), ()
@@ -647,7 +652,8 @@ class OnnxFile(Model):
         only = {self.inputs[0]: inputs[""]} if "" in inputs else inputs
         types = {name: NUMBERS[self._given[name].type] for name in self.inputs}
         rows = {name: np.ascontiguousarray(only[name], kind) for name, kind in types.items()}
-        n, axes = len(rows[self.inputs[0]]), self._axes
+        n = len(rows[self.inputs[0]])
+        axes = self._axes
         if axes is not None:
             output, after = self._run(
                 rows, [np.moveaxis(x, 0, k) for x, k in zip(state, axes, strict=True)]
@@ -761,7 +767,8 @@ class Mapped(RowPolicy):
 
     def _check_inputs(self) -> None:
         """Raise a PolicyError where the model takes other inputs."""
-        expected, inputs = self.model.expected, self.inputs
+        expected = self.model.expected
+        inputs = self.inputs
         goes = isinstance(self.model, Function) and self.model.takes_goal
         if goes and (self.goal_space is None or inputs is not None):
             raise PolicyError(
@@ -871,12 +878,17 @@ class Mapped(RowPolicy):
             return self.outputs(output, len(rows), turn.mask, turn)[0]
         if self.period == 1:
             return self._inferred(memory, rows, obs, turn)[0]
-        phase, held = memory["phase"][rows], memory["held"]
+        phase = memory["phase"][rows]
+        held = memory["held"]
         due = np.flatnonzero(phase == 0)
         if len(due):
-            now, seen, how = rows, obs, turn
+            now = rows
+            seen = obs
+            how = turn
             if len(due) < len(rows):
-                now, seen, how = rows[due], obs[due], turn.some(due)
+                now = rows[due]
+                seen = obs[due]
+                how = turn.some(due)
             for i, action in enumerate(self._inferred(memory, now, seen, how)):
                 held[now, i] = action
         memory["phase"][rows] = (phase + 1) % self.period
@@ -897,7 +909,9 @@ class Mapped(RowPolicy):
 
     def _inferred(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> list[Array]:
         """Return the next actions, (k, …) each."""
-        n, outputs, chunk = len(rows), self.outputs, self.chunk
+        n = len(rows)
+        outputs = self.outputs
+        chunk = self.chunk
         output, after = self.infer(memory, rows, obs, turn)
         if chunk is None:
             several = [output]

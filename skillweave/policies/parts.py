@@ -55,7 +55,8 @@ def joined(obs: Array, goal: Array, axes: int = 1) -> Array:
     joint = np.zeros(
         goal.shape[:axes], joint_dtype(obs.dtype, obs.shape[axes:], goal.dtype, goal.shape[axes:])
     )
-    joint[OBSERVATION], joint[GOAL] = obs, goal
+    joint[OBSERVATION] = obs
+    joint[GOAL] = goal
     return joint
 
 
@@ -161,7 +162,9 @@ class Slice:
     """Begins messages."""
 
     def __post_init__(self) -> None:
-        space, own, places = self.space, self.own, self.places
+        space = self.space
+        own = self.own
+        places = self.places
         if (self.inputs is None) != (self.sees is None):
             raise PolicyError("Part.inputs and Part.sees must be given together")
         self._computes = any(
@@ -199,7 +202,8 @@ class Slice:
 
     def _own_choices(self) -> tuple[Array, Array | None]:
         """Return the places of its choices among all, and its numbers of a mask; None: none."""
-        counts, places = self.space.counts, self._places
+        counts = self.space.counts
+        places = self._places
         if places is None:
             numbers = iter(range(len(counts)))
             of = {k: [next(numbers) for _ in x.counts] for k, x in self.space.leaves.items()}
@@ -216,7 +220,8 @@ class Slice:
 
     def see(self, obs: Array) -> Array:
         """Return what its policy sees of observations (…, *obs_shape), without a goal."""
-        obs, space = obs if self.view is None else self.view(obs), self.sees
+        obs = obs if self.view is None else self.view(obs)
+        space = self.sees
         if self.inputs is None or space is None:
             return obs
         lead = obs.shape[: obs.ndim - self.axes]
@@ -348,7 +353,8 @@ class PartOf(Around):
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return whole actions (k, …)."""
-        part, last = self.part, turn.world.last_action
+        part = self.part
+        last = turn.world.last_action
         own = Turn(turn.world, part.mask(turn.mask), turn.goal, turn.greedy)
         actions = self.policy.act(memory, rows, part.see(obs), own)
         actions = part.write(actions, None if last is None else last[rows])

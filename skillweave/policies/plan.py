@@ -159,7 +159,8 @@ class OptionGroup:
             Pieces (n, options, k), distances (n, options, k), infinite where there are fewer; and
             the calls whose goals the options have, (n, options), −1: none.
         """
-        n, many = len(to), k if self.options == 1 else self.options
+        n = len(to)
+        many = k if self.options == 1 else self.options
         pieces = np.zeros((n, self.options, k), np.int64)
         far = np.full(pieces.shape, np.inf, np.float32)
         if not len(self.rows):
@@ -167,7 +168,8 @@ class OptionGroup:
         near, off = self._nearest(to, many, without)
         goal = np.where(np.isfinite(off), self.goal[near], -1)[:, : self.options]
         if self.options == 1:
-            pieces[:, 0], far[:, 0] = self.rows[near], off
+            pieces[:, 0] = self.rows[near]
+            far[:, 0] = off
             return pieces, far, goal
         assert aims is not None
         for some in _blocks(n, many**2):
@@ -259,7 +261,8 @@ class Options:
         found = []
         for group in self.groups:
             skill = self.skill_of[group.choice]
-            to, aims = features[skill], self.aims[skill]
+            to = features[skill]
+            aims = self.aims[skill]
             pieces, far, goal = group.near(to, self.neighbors, aims, without)
             limit = FURTHER * np.maximum(far[..., :1], np.float32(group.usual))
             found.append((pieces, np.where(far <= limit, far, np.float32(np.inf)), goal))
@@ -312,7 +315,8 @@ def nearest(
         near.sort(axis=1)
     # Differences again: those of squares are wrong by rounding where points are near.
     distance = np.sqrt(((points[near] - to[:, None]) ** 2).sum(2))
-    groups, each = group[near], np.arange(len(to))[:, None]
+    groups = group[near]
+    each = np.arange(len(to))[:, None]
     order = np.lexsort((distance, groups))
     groups, ordered = groups[each, order], distance[each, order]
     ordered[:, 1:][groups[:, 1:] == groups[:, :-1]] = np.inf
@@ -392,8 +396,10 @@ class Machine:
 
     def __post_init__(self) -> None:
         check("keeps", self.keeps, "b", (None, None, None))
-        (states, most, self.slots), events = self.keeps.shape, len(self.events) + 2
-        arrows, counters = (states, most), (states, self.slots)
+        (states, most, self.slots) = self.keeps.shape
+        events = len(self.events) + 2
+        arrows = (states, most)
+        counters = (states, self.slots)
         if not 0 <= self.first < states:
             raise PolicyError(f"a plan's task starts in state {self.first} of {states}")
         check("counted", self.counted, "iu", counters, 0, events)
@@ -417,7 +423,8 @@ class Machine:
     def read(self, step: Step) -> Readings:
         """Evaluate all events and rewards on n steps."""
         n, last = len(step.reward), len(self.events)
-        events, values = np.zeros((n, last + 2), bool), np.zeros((n, len(self.rewards) + 1))
+        events = np.zeros((n, last + 2), bool)
+        values = np.zeros((n, len(self.rewards) + 1))
         for i, (event, reads) in enumerate(self.events):
             events[:, i] = event(step.next_obs if reads == "obs" else step)
         events[:, last + 1] = True
@@ -453,7 +460,8 @@ class Machine:
         after[..., 0] = np.where(moves, self.target[q, arrow], q)
         if self.slots:
             after[..., 1:][moves[..., None] & ~self.keeps[q, arrow]] = 0
-        paid, each = np.where(moves, self.paid[q, arrow], 0.0), self.each[q]
+        paid = np.where(moves, self.paid[q, arrow], 0.0)
+        each = self.each[q]
         reward: Array = paid + each
         if self.rewards:
             reward += np.where(moves, readings.values[rows, self.paid_by[q, arrow]], 0.0)
@@ -517,7 +525,8 @@ class Levels:
         share = np.where(self.levels[q] > 1, share, 0.0)
         places, weights = [], []
         for upper in itertools.product((0, 1), repeat=state.shape[-1] - 1):
-            place, weight = np.zeros(q.shape, np.int64), np.ones(q.shape)
+            place = np.zeros(q.shape, np.int64)
+            weight = np.ones(q.shape)
             for slot, up in enumerate(upper):
                 at = np.minimum(low[..., slot] + up, self.levels[q, slot] - 1)
                 place = place * self.levels[q, slot] + at

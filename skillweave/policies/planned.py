@@ -54,7 +54,8 @@ class Planned(Rule):
     advice = "the log has no call of {0!r}, so record some"
 
     def __post_init__(self) -> None:
-        options, count = self.options, len(self.skills)
+        options = self.options
+        count = len(self.skills)
         if not len(self.features) == len(options.aims) == count:
             raise PolicyError(
                 f"a plan of the skills {self.skills} has features of {len(self.features)}, and "
@@ -90,7 +91,9 @@ class Planned(Rule):
 
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments: the task's state, and no call so far."""
-        state, calls, options = self.task.start(n), (n, LATEST), len(self.options.choice_of)
+        state = self.task.start(n)
+        calls = (n, LATEST)
+        options = len(self.options.choice_of)
         shapes = {
             "start": self._calls,
             "end": self._calls,
@@ -138,12 +141,11 @@ class Planned(Rule):
         Args:
             with_goals: these calls have the goals of their options; a guide does not say which.
         """
-        features, each = [own(obs) for own in self.features], np.arange(len(rows))
+        features = [own(obs) for own in self.features]
+        each = np.arange(len(rows))
         tried = memory["tried"]
-        near, corners = (
-            self.options.near(features),
-            self.levels.corners(self.state_of(memory, rows)),
-        )
+        near = self.options.near(features)
+        corners = self.levels.corners(self.state_of(memory, rows))
         may = turn.mask
         may = np.ones((len(rows), self.count), bool) if may is None else may
         now = {
@@ -186,7 +188,8 @@ class Planned(Rule):
     def follow(self, memory: Memory, rows: Array, read: Readings, last: LastCall) -> None:
         """Do what ``watch`` does, with what the task has read of the step."""
         after, reward = self.task.advance(self.state_of(memory, rows), read)
-        memory["state"][rows], memory["counters"][rows] = after[:, 0], after[:, 1:]
+        memory["state"][rows] = after[:, 0]
+        memory["counters"][rows] = after[:, 1:]
         tried = memory["tried"]
         latest = rows, (tried["count"][rows] - 1) % LATEST
         discount = tried["discount"][latest]
@@ -248,7 +251,7 @@ class Planned(Rule):
         return option
 
     def record(self, choice: Array, call: Array, obs: Array) -> Array:
-        """Return choices (n,) as a ``Hierarchy`` takes them, with the goals of calls.
+        """Return choices (n,) as a ``CallAndReturn`` takes them, with the goals of calls.
 
         Args:
             choice: (n,) numbers.
@@ -258,7 +261,8 @@ class Planned(Rule):
         Raises:
             SkillError: a skill with goals has none.
         """
-        found, skill = [], self.options.skill_of[choice]
+        found = []
+        skill = self.options.skill_of[choice]
         for name, space in self.goals.items():
             mine = np.flatnonzero((skill == self.number(name)) & (call >= 0))
             found.append((name, mine, space.of_numbers(self.numbers[name][call[mine]])))
@@ -305,7 +309,8 @@ class Planned(Rule):
         ends = {k: np.concatenate([calls[k], v[at, None]], 1) for k, v in now.items()}
         far, counts = self._counts(calls, ends)
         weight = np.where(counts, TRUST / (far + SOFT), 0.0)
-        own, logged = weight.sum(2), ends["q"]
+        own = weight.sum(2)
+        logged = ends["q"]
         known = np.isfinite(logged)
         total = np.where(known, ends["total"], 0.0)
         base = np.where(known, logged, 0.0) * total
@@ -331,7 +336,8 @@ class Planned(Rule):
         Returns:
             (k, E, C, O) float32, or (k, E, C, 1) where no skill has goals; and (k, E, C, O) bool.
         """
-        choice, each = calls["choice"], np.arange(len(calls["choice"]))[:, None]
+        choice = calls["choice"]
+        each = np.arange(len(calls["choice"]))[:, None]
         skill = self.options.skill_of[np.maximum(choice, 0)]
         to = ends["end"][each, :, skill].swapaxes(1, 2)  # (k, E, C, F)
         start = calls["start"][each, np.arange(LATEST), skill]

@@ -136,7 +136,7 @@ class Rule(Selector):
     def _with_goals(
         self, choice: Array, goals: Iterable[tuple[str, Array, Any]], obs: Array
     ) -> Array:
-        """Return choices (k,) with their goals, as a ``Hierarchy`` takes them.
+        """Return choices (k,) with their goals, as a ``CallAndReturn`` takes them.
 
         Args:
             goals: skills, the rows (m,) in which each is chosen, and their goals.
@@ -225,7 +225,9 @@ class Asked(Rule):
         Raises:
             SkillError: it has another form, names unknown skills, or its goals do not fit.
         """
-        chosen, goals, wrong = value, None, _is_other_form(value)
+        chosen = value
+        goals = None
+        wrong = _is_other_form(value)
         if not wrong and isinstance(value, tuple) and len(value) == 2:
             arrays = isinstance(value[1], Mapping | list | tuple) or np.ndim(value[1])
             chosen, goals = value if arrays else (value, None)
@@ -361,7 +363,8 @@ class StateMachine(Rule):
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return a skill of each environment's state, (k,)."""
         state = memory["state"][rows]
-        may, score = self._may(state, obs, turn.mask), self.ranks[state]
+        may = self._may(state, obs, turn.mask)
+        score = self.ranks[state]
         if not turn.greedy:
             score = (turn.world.rng or np.random.default_rng()).random(may.shape)
         skill = np.where(may, score, -1).argmax(axis=1)
@@ -395,7 +398,8 @@ class StateMachine(Rule):
     def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
         """Take the transitions whose events have happened in a step."""
         before = memory["state"][rows]
-        after, waits = before.copy(), np.ones(len(rows), bool)
+        after = before.copy()
+        waits = np.ones(len(rows), bool)
         for origin, target, event in self._arrows:
             taken = waits & (before == origin)
             if not taken.any():

@@ -38,7 +38,9 @@ EXTERNAL_DATA, DATA_LOCATION = 13, 14
 """Fields of a tensor that name another file."""
 NAMES = {"node": (4, 7, 8), "function": (1, 10, 13)}
 """Fields with the name, the domain and the overload of an operator, and of a function."""
-VARINT, BYTES, FIXED = 0, 2, {1: 8, 5: 4}
+VARINT = 0
+BYTES = 2
+FIXED = {1: 8, 5: 4}
 """Protobuf's wire types; of the last ones the numbers of bytes."""
 
 
@@ -92,8 +94,10 @@ def _nodes_by_function(content: bytes, who: str) -> dict[Operator, list[Operator
             if left < 0:
                 raise PolicyError(f"{who} has more than {MOST_FIELDS:,} fields")
             tag, at = _varint(content, at, 5)
-            field, wire = (tag & 0xFFFFFFFF) >> 3, tag & 7
-            value, first = 1, at
+            field = (tag & 0xFFFFFFFF) >> 3
+            wire = tag & 7
+            value = 1
+            first = at
             if wire == VARINT:
                 value, at = _varint(content, at, 10)
             elif wire == BYTES:

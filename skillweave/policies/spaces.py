@@ -210,7 +210,8 @@ class Space:
             return numbers
         if isinstance(value, np.ndarray) and value.dtype == self.record:
             return value
-        given, names = self.by_name(value), list(self.parts)
+        given = self.by_name(value)
+        names = list(self.parts)
         if given is None or (self.kind == "Tuple" and len(given) > len(names)):
             shape = getattr(value, "shape", None)
             has = type(value).__name__ if shape is None else f"an array of shape {shape}"
@@ -257,7 +258,8 @@ class Space:
                 for name, part in names.items()
             ]
             return np.concatenate(masks)
-        mask, size = _numbers(value), sum(self.counts)
+        mask = _numbers(value)
+        size = sum(self.counts)
         if mask.size != size or mask.dtype.kind not in "iubf":
             raise ValueError(
                 f"{what} is {shown(value, 200)}; it must be a number for each choice of {self}, "
@@ -337,9 +339,13 @@ class Space:
         Raises:
             PolicyError: they have another form; ``who`` begins the message, ``kind`` is its type.
         """
-        noun, gave, to = "action", f"{who} returned", ""
+        noun = "action"
+        gave = f"{who} returned"
+        to = ""
         if skill:
-            noun, gave, to = "goal", f"{who} gave goals of", f" for {skill}"
+            noun = "goal"
+            gave = f"{who} gave goals of"
+            to = f" for {skill}"
         shape = (n, *self.shape)
         each = "one environment" if n == 1 else f"each of the {n} environments"
         if value is None:
@@ -404,7 +410,8 @@ class Space:
 
     def of_numbers(self, numbers: Array) -> Array:
         """Return the elements (n, …) of numbers (n, G), as ``flat`` has them."""
-        found, first = self.start(len(numbers)), 0
+        found = self.start(len(numbers))
+        first = 0
         for path, leaf in self.leaves.items():
             part = at(found, path)
             size = math.prod(leaf.shape)
@@ -454,7 +461,8 @@ def space_of(space: Any) -> Space:
     if kind in ("Dict", "Tuple"):
         inner = space.spaces.items() if kind == "Dict" else enumerate(space.spaces)
         return Space(kind, parts={str(name): space_of(part) for name, part in inner})
-    shape, dtype = tuple(space.shape or ()), str(np.dtype(space.dtype))
+    shape = tuple(space.shape or ())
+    dtype = str(np.dtype(space.dtype))
     if kind == "Box":
         return Space(kind, dtype, shape, _one(space.low), _one(space.high))
     start = np.asarray(getattr(space, "start", 0))

@@ -39,9 +39,18 @@ TARGETS = {
 }
 """Tasks by name, with MiniGrid's names."""
 ROOMS = {"small": SMALL} | {name: (room,) for name, room in TARGETS.items()}
-EMPTY, WALL, FLOOR, DOOR, KEY, BALL, BOX, GOAL = 1, 2, 3, 4, 5, 6, 7, 8
+EMPTY = 1
+WALL = 2
+FLOOR = 3
+DOOR = 4
+KEY = 5
+BALL = 6
+BOX = 7
+GOAL = 8
 """Kinds of a cell: the first of its three numbers."""
-OPEN, CLOSED, LOCKED = 0, 1, 2
+OPEN = 0
+CLOSED = 1
+LOCKED = 2
 """A door's state: the third."""
 DISTANCE = np.abs(np.arange(7) - 3)[:, None] + np.abs(np.arange(7) - 6)[None]
 """Steps from the agent to each cell in view, (7, 7)."""

@@ -31,7 +31,11 @@ from skillweave import (
 )
 from skillweave.types import Array
 
-X, Y, ANGLE, LEFT_LEG, RIGHT_LEG = 0, 1, 4, 6, 7
+X = 0
+Y = 1
+ANGLE = 4
+LEFT_LEG = 6
+RIGHT_LEG = 7
 
 
 def movement(step: Step, *columns: int) -> Array:

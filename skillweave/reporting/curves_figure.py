@@ -194,7 +194,8 @@ def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
         for c in read_curves(run)
         if (c.agent == c.stage and c.stage in whole if agent is None else c.agent == agent)
     }
-    before, joined = 0, dict[str, Curve]()
+    before = 0
+    joined = dict[str, Curve]()
     for entry in stages:
         # Curves one after another, each moved by the steps before it.
         for metric, points in points_of_stage.get(entry.name, {}).items():

@@ -101,7 +101,8 @@ class Progress(Listener):
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Report an update after ``steps`` and ``seconds`` of training."""
         stage = self._stages[name]
-        stage.steps, stage.seconds = steps, seconds
+        stage.steps = steps
+        stage.seconds = seconds
         self._recent.append((steps, seconds))
         while len(self._recent) > 2 and self._recent[1][1] < seconds - RECENT:
             self._recent.popleft()
@@ -137,7 +138,8 @@ class Progress(Listener):
 
     def _show(self, name: str, metrics: dict[str, float], speed: str, left: str) -> None:
         """Show a stage and what learns in it, as bars or as lines."""
-        stage, below = self._stages[name], _below(name, metrics)
+        stage = self._stages[name]
+        below = _below(name, metrics)
         share = min(stage.steps / stage.budget, 1.0)
         result = f"return {metrics['return']:.1f}" if "return" in metrics else ""
         if self._display is None:
@@ -197,7 +199,8 @@ class Progress(Listener):
         """
         if not self._several:
             return None
-        here, stages = self._stages[name], self._stages.values()
+        here = self._stages[name]
+        stages = self._stages.values()
         later = sum(s.budget for s in stages if not s.over and s is not here)
         steps, seconds = sum(s.steps for s in stages), sum(s.seconds for s in stages)
         now = 0.0 if here.over else self._left(here) if self._recent else None
@@ -263,7 +266,8 @@ class EpisodeProgress:
                 return
             self._pause = self._display.every
         episodes = f"{self._over:,} of {self._episodes:,} episodes"
-        played, taken = f"{self._steps:,} steps", now - self._started
+        played = f"{self._steps:,} steps"
+        taken = now - self._started
         if self._display is None:
             say(f"{self._name}: {episodes}, {played}")
             self._pause = max(PLAIN_PATIENCE, SPREAD * taken)

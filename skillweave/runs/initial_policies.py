@@ -75,7 +75,8 @@ def learners_of_run(path: Path) -> dict[str, Learnt]:
         for name, policy in run.load_policies(entry.name).items():
             sha256 = sums[name]
             steps = (entry.steps or 0) + (learnt[name].steps if name in learnt else 0)
-            chooses, skill = options_of(run.manifest, name), run.manifest.by_path.get(name)
+            chooses = options_of(run.manifest, name)
+            skill = run.manifest.by_path.get(name)
             of_run = run.manifest.id, chooses, skill, run.manifest.code
             learnt[name] = Learnt(policy, sha256, steps, str(path), *of_run)
     return learnt

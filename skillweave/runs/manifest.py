@@ -320,7 +320,9 @@ class StageEntry:
     def forget_files(self) -> None:
         """Forget what belongs to files of the run that it was trained in."""
         self.metrics_bytes = self.lineage_bytes = self.sha256 = None
-        self.policies, self.starts, self.continued = {}, {}, []
+        self.policies = {}
+        self.starts = {}
+        self.continued = []
 
     @property
     def needs_comparison(self) -> bool:

@@ -332,7 +332,8 @@ class Reflex:
                 f"a Reflex's condition is {short(condition)}; it must be a function of observations"
             )
         fitted(str | None, name, "a Reflex's name")
-        self.condition, self.action = condition, action
+        self.condition = condition
+        self.action = action
         self.name = str(name or getattr(condition, "__name__", "reflex"))
 
     def override(self, space: Data) -> Override:

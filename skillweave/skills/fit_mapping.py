@@ -46,7 +46,8 @@ def fitted_inputs(
     reader = _Reader(space, own)
     inputs: dict[str, Input] = {}
     for name, parts in (mapping.sees or {}).items():
-        field, alone = f"{who}: {_field(name)}", len(parts) == 1
+        field = f"{who}: {_field(name)}"
+        alone = len(parts) == 1
         takes: list[Take] = []
         scaled: list[tuple[Any, int, str]] = []
         for i, source in enumerate(parts):
@@ -86,7 +87,8 @@ class _Reader:
         from skillweave.spaces.packing import obs_dtype
 
         obs_dtype(space)  # raises where the space is not supported
-        self.space, self.own = space, own
+        self.space = space
+        self.own = own
         self.leaves = space_of(space).leaves
 
     def takes(self, source: Source, alone: bool, where: str) -> list[Take]:
@@ -211,7 +213,8 @@ def for_model(inputs: dict[str, Input], expected: Shapes, who: str) -> dict[str,
                 f"{who}: sees has an input {name!r}, which the policy does not take"
                 + suggest(name, expected)
             )
-        wanted, has = expected[name], given.shape
+        wanted = expected[name]
+        has = given.shape
         if fits_shape(has, wanted) or wanted is None:
             found[name] = given
             continue

@@ -45,7 +45,8 @@ class Foreign(Memoryless):
 
     def __init__(self, name: str, observation_space: Any = None, action_space: Any = None) -> None:
         self.name = self._who = name
-        self.observation_space, self.action_space = observation_space, action_space
+        self.observation_space = observation_space
+        self.action_space = action_space
         self._open = observation_space is None, action_space is None
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:

@@ -100,7 +100,8 @@ def draw_from(space: gym.Space[Any], n: int, rng: np.random.Generator) -> Array:
     whole = space_of(space)
     batch = whole.start(n)
     for path, leaf in whole.leaves.items():
-        (low, high), shape = leaf.bounds, (n, *leaf.shape)
+        (low, high) = leaf.bounds
+        shape = (n, *leaf.shape)
         if np.dtype(leaf.dtype).kind in "iub":
             ends = low.astype(np.int64), high.astype(np.int64)
             at(batch, path)[...] = rng.integers(*ends, size=shape, endpoint=True)

@@ -45,7 +45,8 @@ class Goals(CallGoals):
 
         space = skill.goal_space
         assert space is not None
-        self.skill, self.goal_space = skill, space
+        self.skill = skill
+        self.goal_space = space
         self._who = f"skill {path_of(skill)!r}"
         self._label = f"{self._who}: goals()"
         try:
@@ -101,7 +102,8 @@ class Goals(CallGoals):
         Raises:
             SkillError: it is none of the space; the message names ``who``.
         """
-        space, batch = self.space, alone(self.space, goal)
+        space = self.space
+        batch = alone(self.space, goal)
         wrong = isinstance(batch, np.ndarray) and batch.shape != (1, *space.shape)
         if space.parts is None and wrong:
             raise SkillError(

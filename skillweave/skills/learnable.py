@@ -59,7 +59,8 @@ class Layers:
         """Return the arrays as those of a network with the ``prefix``."""
         found: dict[str, Array] = {}
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            found[f"{prefix}.{i}.weight"], found[f"{prefix}.{i}.bias"] = weight, bias[None]
+            found[f"{prefix}.{i}.weight"] = weight
+            found[f"{prefix}.{i}.bias"] = bias[None]
         return found
 
     def beside(self, other: Layers) -> Layers:
@@ -174,7 +175,8 @@ class Learnable:
         """Return the arrays by the names of the algorithm's weights, float32."""
         from skillweave.spaces import action_codec
 
-        networks, log_std = dict(self.networks), self.log_std
+        networks = dict(self.networks)
+        log_std = self.log_std
         if self.env_units and isinstance(action_space, Box):
             low, span, bounded = action_codec(action_space).span
             half = np.where(bounded, 0.5 * np.where(span > 0, span, 1.0), 1.0)

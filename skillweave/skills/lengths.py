@@ -56,7 +56,8 @@ class Lengths:
             if whole:
                 yield value
                 continue
-            last, following = steps[i - 1], steps[i + 1]
+            last = steps[i - 1]
+            following = steps[i + 1]
             while type(following) is int and 0 < 2 * last < following:
                 last *= 2
                 yield last

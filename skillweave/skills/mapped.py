@@ -73,11 +73,15 @@ class MappedPolicy(Functional, Foreign, Model):
             PolicyError: these are not known, or it does not fit; the message names the field.
         """
         self.must_be_bound()
-        who, mapping, model, seen = self._who, self.mapping, self.model, self.observation_space
+        who = self._who
+        mapping = self.mapping
+        model = self.model
+        seen = self.observation_space
         goal_space: Data | None = None
         goal: Array | Wrapped | None = None
         if self._goals is not None:
-            seen, goal_space = without_goal(seen), self._goals.space
+            seen = without_goal(seen)
+            goal_space = self._goals.space
         elif callable(mapping.goal):
             goal = of_numbers(mapping.goal, f"{who}: goal()")
         elif mapping.goal is not None:
@@ -126,7 +130,9 @@ class MappedPolicy(Functional, Foreign, Model):
         Raises:
             PolicyError: it failed.
         """
-        acting, goal, n = self.in_place, None, len(obs)
+        acting = self.in_place
+        goal = None
+        n = len(obs)
         assert isinstance(acting, Mapped)
         if self.joins:
             obs, goal = obs[OBSERVATION], obs[GOAL]
@@ -173,11 +179,10 @@ class MappedPolicy(Functional, Foreign, Model):
                 f"{who}: {self.name} takes no goal, but its skill has goals: {self.advice}"
             )
         check_range(goals, self.mapping.goal_places, f"{who}: {self.name}")
-        aimed, seen = (
-            copy.copy(self),
-            observation_space if self._open[0] else self.observation_space,
-        )
-        aimed._goals, aimed.joins = goals, True
+        aimed = copy.copy(self)
+        seen = observation_space if self._open[0] else self.observation_space
+        aimed._goals = goals
+        aimed.joins = True
         aimed.observation_space = with_goal(seen, goals.goal_space)
         return aimed.bind(aimed.observation_space, action_space, who)
 
@@ -234,7 +239,8 @@ def look_at_outputs(policy: MappedPolicy) -> None:
     who, space = policy._who, policy.observation_space
     size = max(made_up(space, 1).nbytes, 1)
     obs = made_up(space, int(np.clip(MOST_BYTES // size, 4, EXAMPLES)))
-    every, twin = np.arange(len(obs)), policy.twin()
+    every = np.arange(len(obs))
+    twin = policy.twin()
     before = twin.tensors()
     with examples(None), np.errstate(all="ignore"):
         state = FunctionState(None)
@@ -292,7 +298,8 @@ def _note_probabilities(policy: MappedPolicy, outputs: dict[str, Array]) -> None
     """Let a policy give a notice where its outputs for examples are probabilities, not logits."""
     acting = policy.in_place
     assert isinstance(acting, Mapped)
-    meaning, output = acting.outputs, outputs.get("")
+    meaning = acting.outputs
+    output = outputs.get("")
     if not meaning.logits or output is None or output.dtype.kind != "f":
         return
     width = sum(meaning.choices)

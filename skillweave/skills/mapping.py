@@ -307,7 +307,8 @@ class PolicyMapping:
         scaling = fitted(dict[str, Scaling], data.get("scaling", {}), "scaling")
         state = fitted(tuple[tuple[Any, ...], ...], data.get("state", ()), "state")
         single = data.get("single_state", False)
-        every, chunk = data.get("every", 1), data.get("chunk")
+        every = data.get("every", 1)
+        chunk = data.get("chunk")
         return cls(sees, goal, acts, every, chunk, state, single, scaling)
 
 
@@ -331,7 +332,8 @@ def mapping_of(
     """
     try:
         states, single = _checked_state(state)
-        parts, meaning = None if sees is None else checked_sees(sees), _checked_acts(acts)
+        parts = None if sees is None else checked_sees(sees)
+        meaning = _checked_acts(acts)
         scalings = dict(scaling or {})
         return PolicyMapping(parts, goal, meaning, every, chunk, states, single, scalings)
     except DeclarationError as error:

@@ -51,7 +51,8 @@ class OnnxPolicy(MappedPolicy):
     ) -> None:
         super().__init__(str(file), observation_space, action_space, mapping)
         self.data = data
-        inputs, states = self._session.get_inputs(), dict(self.mapping.state)
+        inputs = self._session.get_inputs()
+        states = dict(self.mapping.state)
         free = [i for i in inputs if i.name not in states]
         several = self.mapping.sees is not None and "" not in self.mapping.sees
         if not free or (len(free) > 1 and not several):
@@ -112,7 +113,8 @@ class OnnxPolicy(MappedPolicy):
         if not self._chooses:
             return super().in_place
         space = space_of(self.action_space)
-        size, choices = space.size, sum(space.counts)
+        size = space.size
+        choices = sum(space.counts)
         after = dict(self.mapping.state).values()
         ranks: dict[tuple[bool, ...], list[str]] = {}
         for output in self._session.get_outputs():

@@ -62,7 +62,8 @@ def called(
     except SkillweaveError:
         raise
     except (Exception, SystemExit) as error:
-        about, when = getattr(argument, "shape", None), at_step(getattr(argument, "elapsed", None))
+        about = getattr(argument, "shape", None)
+        when = at_step(getattr(argument, "elapsed", None))
         given = "" if about is None else f" for observations of shape {about}"
         advice = _advice(error, function, argument, ids)
         raise kind(f"{who} raised {error_text(error)}{when}{given}{advice}") from error
@@ -116,7 +117,8 @@ def answer(
     """
     elapsed = None
     if isinstance(about, Step):
-        n, elapsed = len(about.reward), about.elapsed
+        n = len(about.reward)
+        elapsed = about.elapsed
     else:
         n, about = len(about), read_only(about)
 
@@ -153,7 +155,8 @@ def checked(
         SkillError: the value has another shape or type, or a NaN or an infinity; the message
             names the function ``who`` and the step.
     """
-    flags, when = dtype is bool, at_step(elapsed)
+    flags = dtype is bool
+    when = at_step(elapsed)
     if value is None:
         raise SkillError(
             f"{who} returned None{when}, but shape ({n},) was expected: does it lack a return?"
@@ -207,7 +210,8 @@ def required_arguments(function: Any) -> int:
 
 def _advice(error: BaseException, function: Any, argument: Any, ids: Array | None) -> str:
     """Return advice for common mistakes; else an empty string."""
-    text, step = str(error), isinstance(argument, Step)
+    text = str(error)
+    step = isinstance(argument, Step)
     obs = argument.next_obs if step else argument
     keys = getattr(getattr(obs, "dtype", None), "names", None)
     example = f"{'step.next_obs' if step else 'obs'}[{repr(keys[0]) if keys else ':, 0'}]"

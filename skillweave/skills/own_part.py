@@ -222,7 +222,8 @@ Paths = tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]
 
 def _written(acts: Any, space: Space[Any], who: str) -> tuple[Data, tuple[int, ...] | None, Paths]:
     """Return the space of a skill's own actions, and its places or paths, as of ``Part``."""
-    named, data = isinstance(acts, tuple) and isinstance(acts[0], str), space_of(space)
+    named = isinstance(acts, tuple) and isinstance(acts[0], str)
+    data = space_of(space)
     if data.parts is not None and not named:
         raise DeclarationError(
             f"{who}: acts is {short(acts)}, but the action has parts with names "
@@ -240,7 +241,8 @@ def _written(acts: Any, space: Space[Any], who: str) -> tuple[Data, tuple[int, .
     size = sum(data.counts) if one else prod(data.shape)
     places = places_in(acts, size, f"{who}: acts", space)
     if one:
-        low, high = np.array(0), np.array(len(places) - 1)
+        low = np.array(0)
+        high = np.array(len(places) - 1)
         data = Data("Discrete", "int64", (), low, high)
     else:
         low, high = (np.broadcast_to(x, data.shape).reshape(-1)[places] for x in data.bounds)
@@ -299,7 +301,8 @@ class OwnPart:
         from skillweave.spaces.saving import gym_space  # needs torch, which declaring does not
 
         self.who = who
-        self._skill, self._rest = skill, rest
+        self._skill = skill
+        self._rest = rest
         sees, acts = skill.sees, skill.acts
         self.whole_observation_space = observation_space
         self.whole_action_space = self.written_space = action_space
@@ -351,7 +354,8 @@ class OwnPart:
         from skillweave.spaces.observations import image_layout
         from skillweave.spaces.packing import leaf_spaces
 
-        leaves, take = leaf_spaces(self.whole_observation_space), given.takes[0]
+        leaves = leaf_spaces(self.whole_observation_space)
+        take = given.takes[0]
         read = [leaves[x.fields] for x in given.takes if x.source == "observation"]
         if len(given.takes) > 1 and any(image_layout(leaf) is not None for leaf in read):
             raise DeclarationError(
@@ -365,7 +369,8 @@ class OwnPart:
 
     def correct(self, base: Policy, added: Correction) -> None:
         """Let its actions correct those of a ready policy, which is fitted to its spaces."""
-        self.base, self.correction = base, added
+        self.base = base
+        self.correction = added
         self.action_space = Box(-1.0, 1.0, self.written_space.shape, np.float32)
 
     def within(self, view: Callable[[Array], Array], observation_space: Space[Any]) -> OwnPart:

@@ -133,7 +133,10 @@ class Look:
     """
 
     def __init__(self, call: Call, judges: bool | None, before: int, *, wide: bool) -> None:
-        self._call, self._judges, self._before, self._wide = call, judges, before, wide
+        self._call = call
+        self._judges = judges
+        self._before = before
+        self._wide = wide
         self._state = FunctionState(call.owner or call.function, call.fixed)
 
     def check(self, answer: Any, who: str, kind: type[SkillweaveError]) -> None:
@@ -146,11 +149,15 @@ class Look:
         Raises:
             SkillError: its answer does not depend on one environment alone.
         """
-        call, n = self._call, self._call.n
+        call = self._call
+        n = self._call.n
         parts = parts_of(answer)
         if not parts or any(x.shape[:1] != (n,) or not x.size for x in parts.values()):
             return  # the caller says so
-        self._n, self._parts, self._who, self._kind = n, parts, who, kind
+        self._n = n
+        self._parts = parts
+        self._who = who
+        self._kind = kind
         size = sum(x.nbytes for x in call.arrays) // n
         self._most = int(np.clip(MOST_BYTES // max(size, 1), 8, 4096))
         state = self._state
@@ -159,18 +166,21 @@ class Look:
             self._ask_others()
 
     def _ask_others(self) -> None:
-        call, every = self._call, np.arange(self._n)
+        call = self._call
+        every = np.arange(self._n)
         axes = {self._n, *(size for x in call.arrays for size in sizes_in(x))}
         rows = other_rows(self._parts, self._n, axes, self._most, self._before)
         other = self._checked_shape(rows)
         if self._judges is None:
             return
-        few, states = every[: self._most], False
+        few = every[: self._most]
+        states = False
         narrow = sorted({t for x in call.arrays for t in narrow_types(x.dtype)})
         narrow = narrow if self._wide else []
         differs = self._difference(few, "wide" if narrow else "")
         if differs and (narrow or len(few) < self._n):
-            wide, differs = differs, self._difference(every)
+            wide = differs
+            differs = self._difference(every)
             if narrow and not differs and not self._difference(few):
                 self._notice_wrap(wide, narrow[0])
         if differs:
@@ -198,7 +208,9 @@ class Look:
         Raises:
             SkillError: it failed, or has no row for each of them.
         """
-        n, m, certain = self._n, len(rows), []
+        n = self._n
+        m = len(rows)
+        certain = []
 
         def take(x: Any) -> Any:
             fits = isinstance(x, np.ndarray) and x.shape[:1] == (n,)

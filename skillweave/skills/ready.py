@@ -110,7 +110,8 @@ def fitted_to_skill(
     """
     from skillweave.spaces import same_space  # needs torch, which declaring a skill does not
 
-    goals, seen = goals_of(skill), policy.observation_space
+    goals = goals_of(skill)
+    seen = policy.observation_space
     if goals is not None:
         if seen is not None and same_space(seen, observation_space):  # as saved here, for example
             if says := other_goals(goal_part(seen), goals.goal_space):

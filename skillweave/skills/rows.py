@@ -222,13 +222,15 @@ def other_rows(answer: Mapping[str, Array], n: int, taken: set[int], most: int, 
         taken: numbers of rows that would not show a wrong axis.
         look: the number of looks before; every second one takes other rows.
     """
-    order, equal = np.arange(n), np.ones(n, bool)
+    order = np.arange(n)
+    equal = np.ones(n, bool)
     values = next(iter(answer.values())).reshape(n, -1)[:, 0]
     with suppress(TypeError):  # of objects
         order = np.argsort(values, kind="stable")
         equal = values[order] == values[np.roll(order, 1)]
     if look % 2:
-        order, equal = order[::-1], np.roll(equal[::-1], 1)
+        order = order[::-1]
+        equal = np.roll(equal[::-1], 1)
     starts = np.flatnonzero(~equal)
     lengths = np.diff([*starts, n])
     group = order[look % n :][:1]  # all answers are equal

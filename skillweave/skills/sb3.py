@@ -48,7 +48,8 @@ class SB3Policy(TorchPolicy):
         super().__init__(model.policy, seen, taken, mapping)
         self.model_space = model.observation_space
         self.name = self._who = name
-        self.label, self.origin = type(model).__name__, origin
+        self.label = type(model).__name__
+        self.origin = origin
         if hasattr(model.policy, "lstm_actor"):
             raise PolicyError(
                 f"{name} has a recurrent policy, whose state predict() would forget here: give its "
@@ -58,7 +59,8 @@ class SB3Policy(TorchPolicy):
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
         """Return a copy; images may have their channels last if the model transposes them."""
         bound = super().bind(observation_space, action_space, who)
-        mine, theirs = self.model_space, observation_space
+        mine = self.model_space
+        theirs = observation_space
         bytes_alone = mine.dtype == theirs.dtype == np.uint8
         if self.mapping.sees is None and bytes_alone and theirs.shape and len(theirs.shape) == 3:
             height, width, channels = theirs.shape
@@ -105,7 +107,8 @@ class SB3Policy(TorchPolicy):
         if self.mapping.sees is None:
             parts = unpack(self.observation_space, parts)
         how = {}
-        acting, mask = self.in_place, None
+        acting = self.in_place
+        mask = None
         if turn.mask is not None and isinstance(acting, Mapped):
             mask = acting.outputs.allowed(turn.mask)
         if mask is not None and "action_masks" in signature(self.module.predict).parameters:
@@ -211,7 +214,8 @@ def from_sb3(
     """
     options = {"sees": sees, "goal": goal, "acts": acts, "every": every}
     fitted(bool, learn, "from_sb3(): learn")
-    file, origin = None, dict[str, str]()
+    file = None
+    origin = dict[str, str]()
     if isinstance(model, str | Path):
         file = Path(model)
         if trust is not True:
@@ -292,7 +296,8 @@ def _learnable(model: Any, name: str, normalize: Any, options: dict[str, Any]) -
         PolicyError: its networks are of another kind.
         DeclarationError: a mapping is given.
     """
-    kind, policy = type(model).__name__, model.policy
+    kind = type(model).__name__
+    policy = model.policy
     given = [k for k, v in options.items() if v is not None and v != 1]
     if given:
         raise DeclarationError(no_mapping(f"from_sb3(learn=True): {name}", " and ".join(given)))

@@ -73,7 +73,9 @@ class ScriptedPolicy(MappedPolicy):
 
     def _ask(self, *given: Any, **named: Any) -> Any:
         """Return what the function makes of its inputs, and perhaps of a goal or a state."""
-        who, mapping, space = self._who, self.mapping, self.action_space
+        who = self._who
+        mapping = self.mapping
+        space = self.action_space
         first, more = (given[0], given[1:]) if given else (None, ())
         looks = all(shape[0] is None for shape in mapping.state)
         value = called(

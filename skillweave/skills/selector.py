@@ -81,7 +81,8 @@ class ReadySelector(Functional, Foreign):
         Raises:
             DeclarationError: it names another skill.
         """
-        selector, rule = copy.copy(self), Rule(self.kind, skills, {})
+        selector = copy.copy(self)
+        rule = Rule(self.kind, skills, {})
         selector.skills = skills
         for where, name, _ in self.named():
             rule.number(name, f": {where}", DeclarationError)

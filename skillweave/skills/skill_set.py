@@ -110,7 +110,8 @@ def acting_policy(
             it is in the ``World``.
     """
     if guide is not None and guide.decides:
-        selector, guide = guide.selector, None
+        selector = guide.selector
+        guide = None
     policy: RowPolicy = CallAndReturn(
         None if selector is None else in_place(selector, "the selector's act()"),
         tuple(_skill(skills, i) for i in range(len(skills.skills))),
@@ -129,7 +130,8 @@ def acting_policy(
 
 def acting_alone(skills: SkillSet, i: int) -> RowPolicy:
     """Return the policy of skill ``i`` without a selector, with reflexes."""
-    skill, space = skills.skills[i], skills.action_space
+    skill = skills.skills[i]
+    space = skills.action_space
     policy = acting_apart(skills.policies[i], skill, skills.part(i), skills.reflexes, space)
     goals = goals_of(skill)
     return _remembering(policy if goals is None else Given(policy, goals), skills)
@@ -217,13 +219,15 @@ def policy_of(
         return RowPolicy()
     known = isinstance(policy, Functional) and policy.is_plain
     if hasattr(policy, "act"):
-        inside, joins = in_place(policy, who), not (known and policy.joins)
+        inside = in_place(policy, who)
+        joins = not (known and policy.joins)
         if isinstance(inside, Remembers) and not outermost:
             inside = inside.policy
         _check_memory(inside)
     else:  # a hierarchy that learns
         how = policy.skills, policy.selector, policy.guide, policy.goals
-        inside, joins = acting_policy(*how, outermost=outermost), policy.goals is None
+        inside = acting_policy(*how, outermost=outermost)
+        joins = policy.goals is None
     inside = Joined(inside) if joins and goals is not None else inside
     if part is None or part.correction is None:
         return inside

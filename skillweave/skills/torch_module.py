@@ -128,7 +128,8 @@ class TorchPolicy(MappedPolicy):
 
         from skillweave.spaces import unpack
 
-        mapping, given = self.mapping, dict[str, Any](inputs)
+        mapping = self.mapping
+        given = dict[str, Any](inputs)
         if mapping.sees is None:
             given[""] = unpack(self.observation_space, given[""])
         weights = [*self.module.parameters(), *self.module.buffers()]
@@ -185,7 +186,8 @@ class TorchPolicy(MappedPolicy):
         import safetensors.torch
         import torch
 
-        policy, module = copy.copy(self), self._own_module()
+        policy = copy.copy(self)
+        module = self._own_module()
         try:
             with torch.device("cpu"):  # the user may have changed the default device
                 weights = safetensors.torch.load(content)

@@ -172,7 +172,8 @@ class JointCodec(ActionCodec):
 
     def units(self, action: Any, at: int) -> Any:
         """Return the parts ``at`` of actions (…, size) as their own codec has them."""
-        codec, part = self.members[at][1], action[..., self.columns[at]]
+        codec = self.members[at][1]
+        part = action[..., self.columns[at]]
         if not codec.discrete:
             return part
         part = part.long() if isinstance(part, Tensor) else part.astype(np.int64)
@@ -317,10 +318,8 @@ def unsupported_action(space: gym.Space[Any], place: str = "") -> EnvError:
             f"; whole numbers of a Box need bounds and at most {MOST_CHOICES} values each, "
             f"{MOST_OF_ALL:,} in all"
         )
-        what, function = (
-            "Let a function round real numbers to it",
-            "gymnasium.spaces.Box(-1.0, 1.0, ...)",
-        )
+        what = "Let a function round real numbers to it"
+        function = "gymnasium.spaces.Box(-1.0, 1.0, ...)"
     return EnvError(
         f"{named_action(space, place)} is not supported; supported are: {supported}. {what}: "
         "EnvSpec(env, wrappers=(lambda env: gymnasium.wrappers.TransformAction(env, function, "

@@ -341,11 +341,14 @@ def _described(leaf: _Leaf) -> str:
 
 def _leaf(space: Any, names: tuple[str, ...], dtype: np.dtype[Any]) -> _Leaf:
     """Return the leaf to which these names lead in observations of type ``dtype``."""
-    offset, shape, place = 0, obs_shape(space), None
+    offset = 0
+    shape = obs_shape(space)
+    place = None
     for name in names:
         assert dtype.fields is not None
         field, start_of = dtype.fields[name][:2]
-        dtype, offset = field.base, offset + start_of
+        dtype = field.base
+        offset = offset + start_of
     if names:
         place = slice(offset, offset + int(np.prod(shape)) * dtype.itemsize)
     choices, start = _choices(space)

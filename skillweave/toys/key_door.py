@@ -176,7 +176,8 @@ def _draw_key(canvas: Canvas, x: float, y: float, size: float) -> None:
     shaft = canvas.bar((x - 0.01 * size, y), (x + 0.11 * size, y), 0.028 * size)
     shape = np.minimum(ring, shaft)
     for tooth in (0.07, 0.11):
-        start, end = (x + tooth * size, y), (x + tooth * size, y - 0.045 * size)
+        start = (x + tooth * size, y)
+        end = (x + tooth * size, y - 0.045 * size)
         shape = np.minimum(shape, canvas.bar(start, end, 0.026 * size))
     canvas.paint(shape - 0.012, DARK_GOLD)
     canvas.paint(shape, GOLD)

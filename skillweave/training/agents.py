@@ -57,7 +57,9 @@ class Agents:
     """
 
     def __init__(self, stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> None:
-        self.stage, self.entry, self.task = stage, stage.entry, stage.learning_task
+        self.stage = stage
+        self.entry = stage.entry
+        self.task = stage.learning_task
         entry = self.entry
         if entry.evolution is not None:
             raise DeclarationError(f"stage {entry.name!r} evolves: it needs a population to train")
@@ -78,7 +80,9 @@ class Agents:
 
     def open(self) -> None:
         """Make the learning algorithms, and the environments."""
-        stage, task, num_envs = self.stage, self.task, self.entry.num_envs
+        stage = self.stage
+        task = self.task
+        num_envs = self.entry.num_envs
         manifest = stage.run.manifest
         self.algorithms: dict[str, Algorithm] = {}
         for name in self.entry.learns:
@@ -173,7 +177,8 @@ class Agents:
 
     def _learner(self, name: str, tensors: dict[str, Tensor]) -> Learner:
         """Return a learner that continues from a checkpoint or an earlier stage, or is fresh."""
-        state, algorithm = self._initial_state(name), self.algorithms[name]
+        state = self._initial_state(name)
+        algorithm = self.algorithms[name]
         if self.together and self.earlier[name] is not None and not tensors:
             self._report_lost_state(name)
         device = resolve_device(algorithm.config.device)
@@ -249,7 +254,8 @@ class Agents:
 
     def _quota(self, name: str) -> int | None:
         """Return the valid rows that a learner from rollouts waits for; None: as one alone does."""
-        together, config = self.together, self.algorithms[name].config
+        together = self.together
+        config = self.algorithms[name].config
         if together is None or self.algorithms[name].store != "rollout":
             return None
         if relative(name, self.level) in (SELECTOR, CRITIC):
@@ -302,7 +308,9 @@ class Agents:
 
     def train(self) -> dict[str, AgentPolicy]:
         """Learn until the budget is spent or the target is reached; return the policies."""
-        log, steps, made = self.log, self.loop.at.steps, self.collectors.steps_made
+        log = self.log
+        steps = self.loop.at.steps
+        made = self.collectors.steps_made
         try:
             self.loop.run()
         except (_TargetReached, _Stopped) as end:
@@ -328,7 +336,9 @@ class Agents:
 
     def _on_tick(self, tick: Tick) -> None:
         """Evaluate where it is due, and write a report; raise at the end of the stage."""
-        log, best, budget = self.log, self.best, self.entry.budget
+        log = self.log
+        best = self.best
+        budget = self.entry.budget
         log.report_reset(self.collectors.begun_anew, self.collectors.num_envs)
         self.collectors.begun_anew = 0
         log.report_episodes(self.loop.episodes.tally, over=False)
@@ -394,7 +404,8 @@ class Agents:
 
     def _report_little_learnt(self) -> None:
         """Report skills that learnt nothing beside others."""
-        steps, counts = self.log.at.steps, {} if self.joint is None else self.joint.counts
+        steps = self.log.at.steps
+        counts = {} if self.joint is None else self.joint.counts
         for name, (rows, updates) in counts.items():
             if decides(name):
                 continue

@@ -358,7 +358,8 @@ def evaluate(
                 seeds = seeds[0] % POOL_SEEDS
             most = max_steps or longest_evaluation(own_limit)
             starts = SeededEpisodes(envs, seeds, most)
-            first, rng = starts.obs[:1].copy(), np.random.default_rng([seed, 1])
+            first = starts.obs[:1].copy()
+            rng = np.random.default_rng([seed, 1])
             moments = play(policy, starts, deterministic=deterministic, rng=rng, seed=seed)
             if max_steps is None and own_limit is None:
                 moments = _with_notice(moments, spec.name, most)
@@ -464,9 +465,15 @@ def _scored(
     calls: PlayedCalls,
 ) -> Evaluation:
     """Play all episodes and return their scores."""
-    returns, lengths, cut = np.zeros(episodes), np.zeros(episodes, np.int64), 0
-    success, skill, goals = np.zeros(episodes), calls.alone, None
-    success_known, once, alike = False, np.zeros(episodes, bool), SameEpisodes()
+    returns = np.zeros(episodes)
+    lengths = np.zeros(episodes, np.int64)
+    cut = 0
+    success = np.zeros(episodes)
+    skill = calls.alone
+    goals = None
+    success_known = False
+    once = np.zeros(episodes, bool)
+    alike = SameEpisodes()
     has_skills = skill is not None or bool(policy.labels)
     if (own := goals_of(skill)) is not None:
         goals = own.start(episodes)
@@ -490,7 +497,8 @@ def _scored(
             watch(played)
     reached = None
     if skill is not None and skill.defines("success"):
-        rows, reached = calls.recorders()[""].rows(), np.zeros(episodes, bool)
+        rows = calls.recorders()[""].rows()
+        reached = np.zeros(episodes, bool)
         reached[rows["episode"]] = rows["succeeded"]
     handovers = tuple(weak_handovers(calls)) if has_skills else ()
     success_known &= not np.isnan(success).any()

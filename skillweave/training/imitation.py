@@ -61,7 +61,8 @@ def imitate(
         )
     state = algorithm.init([seeds])
     rows = to_tensor(np.ascontiguousarray(pack(space, obs)))[None]
-    mask, wanted = torch.from_numpy(may)[None], torch.from_numpy(np.float32(chances))[None]
+    mask = torch.from_numpy(may)[None]
+    wanted = torch.from_numpy(np.float32(chances))[None]
     action = None
     if with_goals is not None:
         action = torch.from_numpy(algorithm.head.codec.from_env(with_goals[1]))[None]

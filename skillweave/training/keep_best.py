@@ -23,7 +23,8 @@ class KeepBest:
     """
 
     def __init__(self, of: Literal["return", "success"], wanted: bool = True) -> None:
-        self.of, self.wanted = of, wanted
+        self.of = of
+        self.wanted = wanted
         self.found: BestSoFar | None = None
         """The steps of the stage at this evaluation, and its metrics; None: none yet."""
         self.states: dict[str, Any] = {}

@@ -130,7 +130,8 @@ class RolloutLearner:
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
         """Make an update if the store has enough rows."""
         stack = self._stack
-        gamma, reference = stack.state.gamma, self.reference
+        gamma = stack.state.gamma
+        reference = self.reference
         rollout = self._store.rollout(gamma, self._progress, reference)
         if rollout is None:
             return {}

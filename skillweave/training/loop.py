@@ -169,7 +169,8 @@ class Loop:
             KeyboardInterrupt: after an interrupt, when a checkpoint is written.
         """
         learner = self.learner
-        self._saved_at, self._saving_took = time.perf_counter(), 0.0
+        self._saved_at = time.perf_counter()
+        self._saving_took = 0.0
         self._started = self._saved_at - self.at.seconds
         self._thread = WorkThread("learner", learner.threads)
         self._pending: Future[dict[str, Tensor]] | None = None

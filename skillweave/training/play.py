@@ -54,8 +54,11 @@ def play(
             action, before the environments step.
         seed: of the goals of a skill that acts alone: each episode has its own.
     """
-    n, acts, world = episodes.num_envs, in_place(policy), World(rng)
-    memory, choose_goals = acts.start(n), getattr(policy, "choose_goals", None)
+    n = episodes.num_envs
+    acts = in_place(policy)
+    world = World(rng)
+    memory = acts.start(n)
+    choose_goals = getattr(policy, "choose_goals", None)
     shown = split(flat(memory))  # the same arrays
 
     def begin(rows: Array) -> None:
@@ -75,7 +78,9 @@ def play(
         before = memory["elapsed"][rows] if "elapsed" in memory else np.ones(len(rows))
         played = episodes.step(action)
         acts.observe(memory, rows, played.step)
-        played.memory, played.acting, played.call_start = shown, acting, before == 0
+        played.memory = shown
+        played.acting = acting
+        played.call_start = before == 0
         yield played
         restarted = episodes.go_on(played)
         if len(restarted):

@@ -58,7 +58,8 @@ class PlayedCalls:
         spec: EnvSpec | None = None,
     ) -> None:
         acts: Any = policy
-        skills, skill = skills_below(policy), getattr(policy, "skill", None)
+        skills = skills_below(policy)
+        skill = getattr(policy, "skill", None)
         self.alone: Skill | None = None
         """The skill that acts alone; None: the whole policy acts."""
         self.prefix = ""
@@ -130,7 +131,8 @@ class PlayedCalls:
             seeds: of the episodes, in order.
         """
         logs = {path: recorder.log() for path, recorder in self.recorders().items()}
-        by_episode, limit = np.array(seeds, np.int64), logs[""].time_limit
+        by_episode = np.array(seeds, np.int64)
+        limit = logs[""].time_limit
         return {
             path: replace(log, seed=by_episode[log.episode], known_time_limit=limit)
             for path, log in logs.items()
@@ -177,7 +179,8 @@ class PlayedCalls:
             tau[waiting[may]] = 0
         runs = np.flatnonzero(tau >= 0)
         tau[runs] += 1
-        end, goal = np.full(len(rows), RUNNING, np.int8), None
+        end = np.full(len(rows), RUNNING, np.int8)
+        goal = None
         if skill.goal_space is not None:
             goal = played.memory[OWN_GOAL][rows]
         if skill.max_steps is not None:
@@ -271,7 +274,8 @@ def _level_calls(path: str, recorder: Recorder, labels: Sequence[str]) -> Array:
     calls = np.zeros(len(rows), [*kept, ("skill", np.int64), ("goal", object)])
     for name, _ in kept:
         calls[name] = rows[name]
-    calls["skill"], calls["goal"] = -1, ""
+    calls["skill"] = -1
+    calls["goal"] = ""
     for i, skill in enumerate(recorder.skills.skills):
         if (name := join(path, skill.name)) in labels:
             mine = np.flatnonzero(recorder.skills.skill_of(rows["choice"]) == i)

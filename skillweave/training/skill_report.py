@@ -150,9 +150,11 @@ def _level_reports(
 ) -> dict[str, SkillReport]:
     """Return the reports of the skills of one level, by their paths."""
     rows, skill, before = _with_before(recorder)
-    skills, alone = recorder.skills.skills, calls.alone is not None and not recorder.path
+    skills = recorder.skills.skills
+    alone = calls.alone is not None and not recorder.path
     names = _paths(calls, recorder)
-    own, over = rows["end_reason"] == CallEnd.OWN, rows["terminated"] | rows["truncated"]
+    own = rows["end_reason"] == CallEnd.OWN
+    over = rows["terminated"] | rows["truncated"]
     judged, pays = (np.array([s.defines(m) for s in skills]) for m in ("success", "reward"))
     won = rows["succeeded"] & judged[skill]
     last = np.roll(rows, 1)
@@ -200,11 +202,13 @@ def weak_handovers(calls: PlayedCalls) -> list[str]:
 
     Skills without ``success`` are left out.
     """
-    sentences, recorders = [], calls.recorders()
+    sentences = []
+    recorders = calls.recorders()
     limit = _time_limit(recorders[""].rows())
     for recorder in recorders.values():
         rows, skill, before = _with_before(recorder)
-        names, won = _paths(calls, recorder), rows["succeeded"]
+        names = _paths(calls, recorder)
+        won = rows["succeeded"]
         judged = np.array([s.defines("success") for s in recorder.skills.skills])
         follows = judged[skill] & ((before == 0) | np.roll(won, 1))
         late = _began_late(recorder, rows, limit)

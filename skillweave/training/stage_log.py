@@ -86,7 +86,9 @@ class StageLog:
 
     def stands(self, update: int, steps: int, seconds: float) -> None:
         """Set the counts of the next checkpoint."""
-        self.at.update, self.at.steps, self.at.seconds = update, steps, seconds
+        self.at.update = update
+        self.at.steps = steps
+        self.at.seconds = seconds
 
     def message(self, text: str) -> None:
         """Send a message about the stage to listeners."""
@@ -239,7 +241,9 @@ class StageLog:
             policy.name_outliers(repr(name))
         if self._has_final:
             self.run.keep_final(entry.name)
-        entry.status, entry.steps, entry.seconds = "done", at.steps, round(at.seconds, 3)
+        entry.status = "done"
+        entry.steps = at.steps
+        entry.seconds = round(at.seconds, 3)
         self.run.record_lines(entry)  # so that a later stage notices removed lines
         entry.evaluation_steps = at.evaluation_steps
         entry.steps_per_second = round(at.steps / max(at.seconds, 1e-9), 1)

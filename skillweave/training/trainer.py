@@ -96,7 +96,8 @@ def begin_calls(
     run: RunDirectory, entry: StageEntry, learning_task: LearningTask
 ) -> tuple[LearningTask, Recorder | None]:
     """Return a stage's task, and the recorder of its calls; None: no calls are logged."""
-    steps, skills = run.manifest.log_calls, learning_task.called
+    steps = run.manifest.log_calls
+    skills = learning_task.called
     if steps is None or skills is None:
         return learning_task, None
     info, spec = run.manifest.log_calls_info, learning_task.role.spec

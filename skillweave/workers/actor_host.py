@@ -84,7 +84,8 @@ class ActorHost:
 
     def close(self) -> None:
         """Close the environments, if there are any."""
-        station, self.station = self.station, None
+        station = self.station
+        self.station = None
         if station is not None:
             with suppress(Exception):
                 station.collector.close()

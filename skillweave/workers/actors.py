@@ -55,7 +55,10 @@ class Actors:
     def __init__(
         self, count: int, cpus: float, patience: float, tell: Callable[[str], None]
     ) -> None:
-        self.count, self.cpus, self.patience, self.tell = count, cpus, patience, tell
+        self.count = count
+        self.cpus = cpus
+        self.patience = patience
+        self.tell = tell
         self._kind: Any = ray.remote(num_cpus=cpus, max_restarts=0)(actor_class())
         self._group = placement_group([{"CPU": cpus}] * count)
         self._actors: dict[int, Any] = {}
@@ -111,7 +114,8 @@ class Actors:
             if placement_group_table(self._group)["state"] == "CREATED":  # it is only slow
                 began = now
                 continue
-            self._waited, began = self._waited + now - began, now
+            self._waited = self._waited + now - began
+            began = now
             total = ray.cluster_resources().get("CPU", 0.0)
             free = ray.available_resources().get("CPU", 0.0)
             says = (
@@ -143,9 +147,13 @@ class ActorWorker(Worker):
     tries = 5  # one may be made again on a node of which Ray does not know yet that it is lost
 
     def __init__(self, actors: Actors, code: Any, each: int, number: int, alone: bool) -> None:
-        self._actors, self._code, self._each, self._number = actors, code, each, number
+        self._actors = actors
+        self._code = code
+        self._each = each
+        self._number = number
         self._alone = alone
-        self._due, self._lost = deque[Any](), ""
+        self._due = deque[Any]()
+        self._lost = ""
         self.place: dict[str, Any] = {}
         """Its node and process, and what runs there."""
         self._versions: Any = None

@@ -32,7 +32,8 @@ class Block:
     """Memory that two processes share; the process that writes it makes it larger if needed."""
 
     def __init__(self) -> None:
-        self._file, self._reserved = _unnamed_file(), 0
+        self._file = _unnamed_file()
+        self._reserved = 0
         self._map: mmap.mmap | None = None
 
     def __getstate__(self) -> tuple[Any]:
@@ -44,7 +45,8 @@ class Block:
 
     def __setstate__(self, state: tuple[Any]) -> None:
         (file,) = state
-        self._file, self._reserved = None if file is None else file.detach(), 0
+        self._file = None if file is None else file.detach()
+        self._reserved = 0
         self._map = None
 
     def reserve(self, size: int) -> bool:
@@ -117,7 +119,9 @@ class Channel:
     """
 
     def __init__(self, pipe: Connection, out: Block, back: Block) -> None:
-        self.pipe, self._out, self._back = pipe, out, back
+        self.pipe = pipe
+        self._out = out
+        self._back = back
 
     def send(self, message: Any) -> None:
         """Send anything that can be pickled.

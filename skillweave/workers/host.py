@@ -99,7 +99,8 @@ class WorkerHost:
     """
 
     def __init__(self, make: WorkerFactory, each: int, number: int) -> None:
-        self.number, self.collector = number, make(each, number * each)
+        self.number = number
+        self.collector = make(each, number * each)
 
     def answer(self, what: str, task: Any) -> Any:
         """Do what a method of the collector does; a request is for all workers."""
@@ -123,7 +124,9 @@ class LocalWorker(Worker):
     """
 
     def __init__(self, make: WorkerFactory, each: int, number: int) -> None:
-        self._make, self._each, self._number = make, each, number
+        self._make = make
+        self._each = each
+        self._number = number
         self._station: WorkerHost | None = None
         self._due = deque[tuple[str, Any]]()
 
@@ -145,7 +148,8 @@ class LocalWorker(Worker):
 
     def release(self) -> None:
         """Close what stands here."""
-        station, self._station = self._station, None
+        station = self._station
+        self._station = None
         if station is not None:
             station.collector.close()
 
@@ -270,9 +274,11 @@ class WorkerCollectors(Workers, Collectors):
     """
 
     def __init__(self, workers: Sequence[Worker], each: int, members: int, name: str) -> None:
-        self.members, self.num_envs = members, each * len(workers)
+        self.members = members
+        self.num_envs = each * len(workers)
         self.steps_made = self.begun_anew = 0
-        self.parts, self._each = [], each
+        self.parts = []
+        self._each = each
         none = np.empty(0, np.int64)
         self._stands = [none] * len(workers)  # of each, after what was collected last
         self._differ = [none] * len(workers)  # of each, environments that did not repeat themselves
@@ -317,7 +323,8 @@ class WorkerCollectors(Workers, Collectors):
 
     def differing(self) -> Array:
         """(k,) environments that are not where they were, since they were lost with a worker."""
-        found, none = self._columns(self._differ), np.empty(0, np.int64)
+        found = self._columns(self._differ)
+        none = np.empty(0, np.int64)
         self._differ = [none] * len(self._differ)
         self.begun_anew += len(found)
         return found

@@ -57,14 +57,17 @@ class ProcessWorker(Worker):
     """
 
     def __init__(self, make: WorkerFactory, each: int, number: int) -> None:
-        self._make, self._each, self._number = make, each, number
+        self._make = make
+        self._each = each
+        self._number = number
         self._context: Any = mp.get_context()
         self._modes = TorchModes.here()
         self.process: Any = None
         self.channel: Channel | None = None
         self._answered = False  # this process, at least once
         self._asked, self._since = "", 0.0
-        self._silence, self._told = SILENCE, False
+        self._silence = SILENCE
+        self._told = False
 
     def begin(self) -> None:
         """Start the process, which makes the collector.
@@ -179,7 +182,9 @@ class ProcessWorker(Worker):
             self.channel = None
 
     def _expect(self, asked: str) -> None:
-        self._asked, self._since, self._told = asked, monotonic(), False
+        self._asked = asked
+        self._since = monotonic()
+        self._told = False
 
     def _tell_silence(self) -> None:
         """Give a notice once if there is no answer for a long time."""
@@ -190,7 +195,8 @@ class ProcessWorker(Worker):
             f"it is {self._asked}. If its environments are not as slow as that, one of them hangs: "
             f"py-spy dump --pid {self.process.pid} shows where. Ctrl-C stops the run"
         )
-        self._silence, self._told = 2 * self._silence, True
+        self._silence = 2 * self._silence
+        self._told = True
 
     def _end(self) -> str:
         """Return words for how its process ended."""

@@ -34,7 +34,8 @@ def runs_again() -> str:
     Processes that are not forked import the program's main file. If that trains outside of a
     guard, each of them would train again, which Python refuses.
     """
-    method, main = start_method(), sys.modules.get("__main__")
+    method = start_method()
+    main = sys.modules.get("__main__")
     if method == "fork" or not isinstance(main, ModuleType) or not _is_imported(main):
         return ""
     if main.__name__ == "__mp_main__":  # this process has itself imported it

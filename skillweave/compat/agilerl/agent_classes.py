@@ -94,7 +94,8 @@ class PPO(AgilerlAgent):
         count as drawn with the log-probabilities given.
         """
         states, action, log_prob, reward, ended, _, after = experiences
-        learner, state = self.learner, self.member.state
+        learner = self.learner
+        state = self.member.state
         rewards = tensor_of(reward, np.float32)
         lead = 1, len(rewards), max(1, rewards[0].numel())
         obs = to_tensor(self.rows(states)).unflatten(0, lead)

@@ -105,7 +105,9 @@ def _add_groups(
     page: Page, groups: Sequence[Group], colors: Sequence[str], saved: Saved, say: Say
 ) -> None:
     """Put the groups into the page: their scores, with a chart, and the figures of their skills."""
-    page.context["groups"], dots, bars = [], [], []
+    page.context["groups"] = []
+    dots = []
+    bars = []
     for group, color in zip(groups, colors, strict=True):
         scored = [(run, s.evaluation) for run in group.runs if (s := saved[run.path]) is not None]
         words: dict[str, Any] = {"key": group.key, "name": group.name, "color": color}
@@ -193,7 +195,8 @@ def _run_row(
     }
     if saved is None:
         return row | dict.fromkeys(("mean", "iqm", "solved", "length", "episodes"), NOTHING)
-    score, score_json = saved.evaluation, saved.to_json()
+    score = saved.evaluation
+    score_json = saved.to_json()
     return row | {
         "mean": say(score.mean),
         "iqm": say(score_json["iqm"]),

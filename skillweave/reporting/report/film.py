@@ -122,7 +122,8 @@ def _play(
     every: int,
     progress: EpisodeProgress,
 ) -> None:
-    row, step = np.arange(1), None
+    row = np.arange(1)
+    step = None
     obs = engine.reset_some(row, [shot.seed])
     for t in range(len(shot.actions) + 1):
         if not shot.same(t, obs[0], step):

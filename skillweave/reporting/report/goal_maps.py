@@ -43,7 +43,9 @@ def goal_pictures(
             mine = log.skill == log.number(name)
             if path not in skills or not mine.any():
                 continue
-            space, goals, done = skills[path].goal_space, every[mine], log.succeeded[mine]
+            space = skills[path].goal_space
+            goals = every[mine]
+            done = log.succeeded[mine]
             rows, ranges = _rows(space, goals, done)
             if not rows:
                 continue

@@ -80,7 +80,9 @@ def _base(run: RunDirectory) -> str:
 
 def _distinguishing(groups: Sequence[Group]) -> list[str]:
     """Return few settings that distinguish the groups; each separates them best."""
-    table, names, separate = dict(differences(groups)), list[str](), 1
+    table = dict(differences(groups))
+    names = list[str]()
+    separate = 1
 
     def parts(name: str) -> int:
         """Return how many groups differ in the settings so far and this one."""

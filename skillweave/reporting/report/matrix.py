@@ -64,7 +64,8 @@ def add_handover(
         with_goals: the skills with goals, by path.
         filmed: play calls again, and film them.
     """
-    matrix, named = log.handover(), None
+    matrix = log.handover()
+    named = None
     film: Mp4 | None = None
     before = before_each(log, log.succeeded)
     cells = {
@@ -147,7 +148,8 @@ def _where_rows(
     """Return the middle 80 % of each coordinate where the calls of skills end."""
     rows = []
     for name, values in varying(coordinates(log.end, named)).items():
-        scale, cells = scale_of(np.quantile(values, (0.05, 0.95)).tolist()), []
+        scale = scale_of(np.quantile(values, (0.05, 0.95)).tolist())
+        cells = []
         for skill in called:
             some = values[log.skill == log.number(skill)]
             low, middle, high = (
@@ -195,7 +197,8 @@ def _cell(matrix: Handover, i: int, j: int, reasons: Mapping[str, int]) -> dict[
 
 def _clip(log: CallLog, row: int, film: Mp4, with_goals: Mapping[str, Skill]) -> dict[str, Any]:
     """Return a clip for the page's script."""
-    (before, lead, steps), first = _extent(log, row), film.first[row]
+    (before, lead, steps) = _extent(log, row)
+    first = film.first[row]
     return {
         "from": first,
         "call": first + -(-lead // film.every),
@@ -210,7 +213,8 @@ def _clip(log: CallLog, row: int, film: Mp4, with_goals: Mapping[str, Skill]) ->
 def _goal(log: CallLog, row: int, with_goals: Mapping[str, Skill]) -> str:
     """Return the goal of a call in words; empty: it has none, or its space is not known."""
     name = log.skills[int(log.skill[row])]
-    goals, numbers = goals_of(with_goals.get(name)), log.goals.get(name)
+    goals = goals_of(with_goals.get(name))
+    numbers = log.goals.get(name)
     if goals is None or numbers is None or numbers.shape[1] != goals.space.size:
         return ""
     return shown_goal(goals.space.of_numbers(numbers[[row]])[0])
@@ -228,8 +232,10 @@ def _choose_clips(log: CallLog, cells: Cells, matrix: Handover) -> list[int]:
 
     Cells that are worse than others come first, and two of their calls that were not done.
     """
-    playable, weak = _playable(log), set(matrix.weak())
-    age, chosen = np.array(log.age), list[int]()
+    playable = _playable(log)
+    weak = set(matrix.weak())
+    age = np.array(log.age)
+    chosen = list[int]()
     order = sorted(cells, key=lambda place: (place not in weak, matrix.rate[place]))
     wanted = [(place, done, 2) for place in order for done in (False, True)]
     # A second one of the weak cells if there is room.
@@ -243,9 +249,11 @@ def _choose_clips(log: CallLog, cells: Cells, matrix: Handover) -> list[int]:
         # In the middle of all ages: neither the first calls of an episode nor the last.
         row = int(some[np.argsort(age[some], kind="stable")][len(some) // part])
         _, lead, steps = _extent(log, row)
-        shown, played = filmed + lead + steps, replayed + int(age[row] + log.tau[row])
+        shown = filmed + lead + steps
+        played = replayed + int(age[row] + log.tau[row])
         if row not in chosen and shown <= MOST_FILMED and played <= MOST_REPLAYED:
-            filmed, replayed = shown, played
+            filmed = shown
+            replayed = played
             chosen.append(row)
     return chosen
 
@@ -267,7 +275,9 @@ def _shot(log: CallLog, row: int) -> Shot:
     Raises:
         EnvError: the log has an action that does not exist.
     """
-    (_, lead, shown), before, space = _extent(log, row), int(log.age[row]), log.action_space
+    (_, lead, shown) = _extent(log, row)
+    before = int(log.age[row])
+    space = log.action_space
     calls = np.flatnonzero((log.episode == log.episode[row]) & (log.order <= log.order[row]))
     calls = calls[np.argsort(log.order[calls])]
     steps = np.concatenate([np.arange(log.offset[c], log.offset[c + 1]) for c in calls])

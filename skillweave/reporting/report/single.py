@@ -108,7 +108,9 @@ def write_report(
         RunError: the run is damaged, or the file cannot be written.
         MissingExtra: the extra 'report' is not installed.
     """
-    page, played, log = Page(), None, None
+    page = Page()
+    played = None
+    log = None
     episodes = fitted(AtLeastOne, episodes, "episodes")
     seed = fitted(Count, seed, "seed")
     filmed = fitted(Count, filmed, "films")
@@ -202,7 +204,9 @@ def play_episodes(
 
 def _add_episodes(page: Page, played: Played, spec: EnvSpec, filmed: int, quiet: bool) -> None:
     """Put the calls of the episodes into the page, and a film of some of these."""
-    log, named, film = played.log, spec.observation_names(), None
+    log = played.log
+    named = spec.observation_names()
+    film = None
     if filmed:
         with page.without("is no film"):
             chosen = chosen_episodes(log.episodes, filmed)
@@ -216,7 +220,8 @@ def _add_episodes(page: Page, played: Played, spec: EnvSpec, filmed: int, quiet:
         page.missing.append(misfit)
     shown, left_out = episode_data(log, film, named)
     page.missing += left_out
-    labels, hues = list(log.labels), [hex_of(color) for color in played.colors.values()]
+    labels = list(log.labels)
+    hues = [hex_of(color) for color in played.colors.values()]
     page.context |= {
         "episodes": len(log.episodes),
         "filmed": 0 if film is None else len(film.first),
@@ -277,7 +282,8 @@ def _add_scores(
 
     They are of the saved evaluation, or of the report's episodes if these are as many.
     """
-    source, docs = "of the run's evaluation", dict[str, str]()
+    source = "of the run's evaluation"
+    docs = dict[str, str]()
     saved = load_evaluation(run, deterministic=deterministic)
     if played is not None:
         docs = dict(zip(played.log.labels, map(about, played.log.skills), strict=False))
@@ -309,8 +315,11 @@ def _add_scores(
 
 def score_words(score: Evaluation) -> dict[str, Any]:
     """Return the score as texts; digits fit the scale of the returns."""
-    score_json, n, count = score.to_json(), len(score.returns), solved(score)
-    say, one = partial(number, scale=scale_of(score.returns)), n == 1 or score.all_alike
+    score_json = score.to_json()
+    n = len(score.returns)
+    count = solved(score)
+    say = partial(number, scale=scale_of(score.returns))
+    one = n == 1 or score.all_alike
     return {
         "mean": say(score.mean),
         "interval": None if one else span(score_json["ci95"], say),
@@ -334,7 +343,8 @@ def _add_lineages(page: Page, run: RunDirectory, colors: Mapping[str, str]) -> N
         lineage = read_lineage(run, entry.name)
         if lineage is None:
             continue
-        color, winner = colors[entry.name], lineage.winner
+        color = colors[entry.name]
+        winner = lineage.winner
         tree = charts.family_tree(lineage, color)
         paths = [charts.setting_path(name, lineage, color) for name in lineage.varied]
         page.data["trees"].append({"tree": tree, "paths": paths})

@@ -161,7 +161,8 @@ def coordinates(obs: Array, names: ObsNames | None = None) -> dict[str, Array]:
     parts, named = _by_key(obs, names)
     columns: dict[str, Array] = {}
     for key, part in parts.items():
-        name, part_names = f'obs["{key}"]' if key else "obs", named.get(key)
+        name = f'obs["{key}"]' if key else "obs"
+        part_names = named.get(key)
         if part.dtype.names is not None:
             continue  # a Dict in a Dict
         flat = np.asarray(part).reshape(len(part), -1)
