@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import ast
 import copy
-import inspect
 import re
 from collections.abc import Iterator
 from dataclasses import fields
-from pydoc import locate
 from typing import Any
 
 import griffe
@@ -61,41 +59,17 @@ class PlainTypes(griffe.Extension):
                         attribute.annotation = plain(attribute.annotation, named)
 
 
-class Options(griffe.Extension):
-    """A function of options (``Takes``) reads in the reference as if it listed each of them."""
+class InheritedTexts(griffe.Extension):
+    """A field that a class declares again, without a text, has that of the class above."""
 
     def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
-        """Give such functions their parameters and docstrings, and fields those of their bases."""
+        """Give fields without a docstring those of their bases."""
         for module in _modules(pkg):
             for kind in (k for k in module.classes.values() if not k.is_alias):
                 for field in kind.attributes.values():
                     if field.docstring is None:
                         above = (b.members.get(field.name) for b in kind.mro())
                         field.docstring = next((a.docstring for a in above if a is not None), None)
-            for holder in (module, *module.classes.values()):
-                for function in () if holder.is_alias else holder.functions.values():
-                    for decorator in () if function.is_alias else function.decorators:
-                        if found := re.fullmatch(r"Takes\((\w+)\)", str(decorator.value)):
-                            _list_options(function, module[found[1]])
-
-
-def _list_options(function: griffe.Function, options: griffe.Class) -> None:
-    """Give a function the parameters of its options, as Python makes them at import."""
-    made = locate(function.path)
-    declared = {p.name: p for p in function.parameters}
-    function.parameters = griffe.Parameters(
-        *(
-            declared.get(name)
-            or griffe.Parameter(
-                name,
-                annotation=options.all_members[name].annotation,
-                kind=griffe.ParameterKind(p.kind.description),
-                default=None if p.default is p.empty else repr(p.default),
-            )
-            for name, p in inspect.signature(made).parameters.items()
-        )
-    )
-    function.docstring.value = inspect.getdoc(made)
 
 
 def plain(part: Any, named: dict[str, Any]) -> Any:

@@ -6,11 +6,13 @@ The three classes refer to one another, so they are one module.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
+
+import gymnasium as gym
 
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import as_path, short, shown_path
@@ -19,7 +21,12 @@ from skillweave._internal.paths import AGENT, join, level_of, name_of
 from skillweave._internal.shipped import weights_path
 from skillweave._internal.terminal import printable
 from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy
-from skillweave.algorithms.config import PPO, AlgorithmConfig, config_from_json
+from skillweave.algorithms.config import (
+    PPO,
+    AlgorithmConfig,
+    AlgorithmSettings,
+    config_from_json,
+)
 from skillweave.api.applying import (
     Trained,
     load_policy,
@@ -39,16 +46,11 @@ from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.repairing import repair
 from skillweave.api.run_calls import RunCalls
 from skillweave.api.running import resume, train
-from skillweave.api.train_options import (
-    AgentOptions,
-    AgentTraining,
-    RepairOptions,
-    ResumeOptions,
-    Takes,
-    TrainOptions,
-)
+from skillweave.api.starting import StartFrom
+from skillweave.api.train_options import RepairOptions, TrainOptions
 from skillweave.envs.make import EngineName, EnvSpec
 from skillweave.errors import DeclarationError, RunError
+from skillweave.evolution.evolving import Evolve
 from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.assembly import parts_of
 from skillweave.hierarchy.declaration import Declaration, with_roles
@@ -56,6 +58,14 @@ from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.recorded import calls_of
 from skillweave.hierarchy.repair import Repair, repairs_of
 from skillweave.hierarchy.roles import Roles, roles_of
+from skillweave.hierarchy.settings import (
+    Apart,
+    CallSteps,
+    Guide,
+    Learn,
+    Selection,
+    SelectorValue,
+)
 from skillweave.hierarchy.weights import (
     HierarchyHeader,
     open_weights,
@@ -78,10 +88,13 @@ from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.runs.manifest import LevelEntry, manifest_in
 from skillweave.runs.trackers import track_film
 from skillweave.schema import AtLeastOne, Count, as_json, fitted
-from skillweave.skills import Skill
+from skillweave.skills import Reflex, Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.own_part import ZERO, part_from_json
+from skillweave.training.callback import Callback
+from skillweave.training.defaults import TrainDefaults
+from skillweave.training.env_check import EnvValue
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.evaluation_file import (
     SavedEvaluation,
@@ -89,7 +102,9 @@ from skillweave.training.evaluation_file import (
     save_evaluation,
 )
 from skillweave.training.plain_agent import PlainAgent
+from skillweave.training.stage import Together
 from skillweave.types import Memory, Policy
+from skillweave.workers.cluster import Ray
 
 
 class Trainable:
@@ -102,17 +117,40 @@ class Trainable:
         """Return tables of the declaration, for notebooks."""
         return declared_html(self)
 
-    @Takes(ResumeOptions)
-    def resume(self: Any, options: ResumeOptions) -> Run:
+    @checked_names
+    def resume(
+        self: Any,
+        run_dir: str | Path,
+        *,
+        quiet: bool = False,
+        callback: Callback | None = None,
+        evolve: Evolve = None,
+        cluster: Ray | None = None,
+    ) -> Run:
         """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
 
         The run's settings count, its steps too, and the code of this declaration: methods,
         functions, conditions. A message lists settings that differ, except a population's. To train
         for more steps: ``train(run_dir, resume=True)``.
 
+        Args:
+            run_dir: the run's directory.
+            quiet: no progress.
+            callback: see ``train``.
+            evolve: needed only where a population evolves by a selection of your own.
+            cluster: run collectors, or parts of a population, on ``Ray``; their number is the
+                run's.
+
         Returns:
             The finished run.
         """
+        options = TrainOptions(
+            as_path(run_dir, "run_dir"),
+            quiet=quiet,
+            callback=callback,
+            evolve=evolve,
+            cluster=cluster,
+        )
         return run_of(resume(self, options))
 
     @checked_names
@@ -124,11 +162,74 @@ class Trainable:
 class Agent(Trainable, PlainAgent):
     """One plain agent that learns an environment's own reward: declared, trained and watched."""
 
-    @Takes(AgentOptions)
-    def train(self, options: AgentOptions) -> Run:
+    @checked_names
+    def train(
+        self,
+        run_dir: str | Path | None = None,
+        *,
+        resume: bool = False,
+        overwrite: bool = False,
+        seed: int = 0,
+        eval_every: int | None = None,
+        eval_episodes: int | None = None,
+        checkpoint_every: int | None = None,
+        keep: Literal["last", "best"] | None = None,
+        log_info: Sequence[str] | None = None,
+        quiet: bool = False,
+        callback: Callback | None = None,
+        evolve: Evolve = None,
+        cluster: Ray | None = None,
+        track: str | Sequence[str] = (),
+        start_from: StartFrom = None,
+    ) -> Run:
         """Train the agent and write everything to ``run_dir``.
 
         Of evaluations, checkpoints and logs, None is what ``train_defaults`` says.
+
+        Args:
+            run_dir: a new directory; None: the next number of ``runs/<name>-<n>``, named after the
+                recipe, the hierarchy or the environment. A run that has saved nothing yet is
+                replaced, unless a process trains it; any other only with ``overwrite``.
+            resume: continue the run in this directory if it has learnt something, else start one.
+                It keeps its settings, and a message lists those that differ. If steps have grown,
+                a finished run continues: in new episodes, with schedules over the new budget.
+                Steps of stages whose learners learn again in a later one go to that stage.
+            overwrite: replace the run in this directory, also a finished one; not with
+                ``resume``. Files there that no run writes stay.
+            seed: the root of every random stream.
+            eval_every: environment steps between evaluations while training, by the learner's own
+                reward; by default there are none. Their results are ``eval_return`` and
+                ``eval_success`` in ``metrics.jsonl``.
+            eval_episodes: episodes of each of these evaluations, by default 20.
+            checkpoint_every: environment steps between checkpoints, by default 100,000.
+            keep: "best": each stage ends with the weights whose periodic evaluation was best, by
+                the mean return or by what its target is of; the last weights are evaluated, too.
+                It needs ``eval_every``. A population ends with its best member in any case. By
+                default "last".
+            log_info: keys of ``info``: the mean of each over the latest 100 episodes is
+                ``info/<key>`` in ``metrics.jsonl`` and in trackers. Each episode counts with the
+                value in its last step (in a skill's own stage, its call's). None, NaN and
+                infinity are left out.
+            quiet: no progress.
+            callback: a function that is called with a ``TrainEvent`` for each report of training
+                and each checkpoint. Where it returns False, the stage ends with what it has
+                learnt, as at a target, and the next one starts. An exception in it stops the
+                training and leaves ``train`` unchanged; the run can be resumed from its last
+                checkpoint. It is called in this process, and is not stored in the run.
+            evolve: a population for every stage, or for some by name (a skill's, "selector",
+                "agent"). Its budget is the stage's for each member, measuring fitness included.
+                Skills and selector of a population cannot learn together yet: they learn apart. A
+                run that continues needs it only where the population evolves by a selection of
+                your own.
+            cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
+                where it pays. A run that continues keeps their number.
+            track: any of "tensorboard", "wandb" and "mlflow": one, or a list.
+            start_from: another run, or its directory: a learner that has learnt there, by the same
+                name, starts with its policy. Or several runs, by learner: ``{"left": run,
+                "right": other}``; a run of a plain agent fits any name. The policy is copied (of
+                PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
+                spaces, networks and the names of a selector's skills must be the same. In place of
+                a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
 
         Returns:
             The finished run.
@@ -140,6 +241,23 @@ class Agent(Trainable, PlainAgent):
             RunError: ``run_dir`` holds something else, or no learner can start from
                 ``start_from``.
         """
+        options = TrainOptions(
+            run_dir,
+            resume=resume,
+            overwrite=overwrite,
+            seed=seed,
+            eval_every=eval_every,
+            eval_episodes=eval_episodes,
+            checkpoint_every=checkpoint_every,
+            keep=keep,
+            log_info=log_info,
+            quiet=quiet,
+            callback=callback,
+            evolve=evolve,
+            cluster=cluster,
+            track=track,
+            start_from=start_from,
+        )
         return run_of(train(self, options))
 
     @classmethod
@@ -177,6 +295,8 @@ class Agent(Trainable, PlainAgent):
         return Run(agent, path, read_agent(agent.spec, tensors, header, path))
 
 
+@checked_names
+@dataclass(repr=False)
 class Hierarchy(Trainable, Declaration):
     """Skills, reflexes and a selector on one environment: declared, then trained and watched.
 
@@ -191,13 +311,136 @@ class Hierarchy(Trainable, Declaration):
 
     run = sw.Hierarchy("CartPole-v1", [Middle()]).train("runs/middle")
     ```
+
+    Raises:
+        DeclarationError: the declaration is wrong; the message names the skill and the field.
     """
 
-    @Takes(TrainOptions)
-    def train(self, options: TrainOptions) -> Run:
+    env: EnvValue
+    """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
+    skills: Sequence[Skill]
+    """The skills that the selector chooses from; a hierarchy among them is trained inside."""
+    call_steps: CallSteps = 40
+    """Steps of a skill before the selector decides again; None: until the skill ends by itself."""
+    steps: AtLeastOne | None = None
+    """Training steps in all, split by ``learn``; None: 1,000,000. A budget that a skill, ``apart``
+    or ``together`` sets replaces that part and leaves the others as they are; where all parts are
+    set, leave this out."""
+    learn: Learn = "together"
+    """Train skills and selector from the same steps ("together"); or skills one by one, then the
+    selector ("apart"); or one after the other, half of the steps each ("apart, then together").
+    Where no skill learns, the selector trains alone."""
+    algorithm: AlgorithmSettings = field(default_factory=PPO)
+    """The algorithm of every skill that sets no other."""
+    selector: SelectorValue = field(default_factory=PPO)
+    """The algorithm of the selector; its γ and n_steps count environment steps. Or a ready
+    selector, not trained: a function of observations, an ``Automaton``, or a ``tree.Sequence``."""
+    reflexes: Sequence[Reflex] = ()
+    """Rules that override the running skill's action, also while skills train."""
+    rest: Any = "zero"
+    """The numbers of an action that the running skill does not write (``Skill.acts``): "zero";
+    "hold", as they were in the last action, zero in an episode's first; a number; or a list with a
+    number or "hold" for each number of the action, a dict of these for a Dict action. Zero is what
+    pushes nothing where actions are forces or speeds; hold what is a place, or a grip."""
+    apart: Apart = field(default_factory=Apart)
+    """Settings of learning apart: budgets, and the start of skills."""
+    together: Together = field(default_factory=Together)
+    """Settings of learning together: budget, the task's weight, interruption, exploration."""
+    selection: Selection = field(default_factory=Selection)
+    """Settings of the selector's choices: cost of a call, greedy or sampling."""
+    guide: Guide | None = None
+    """A ready selector that guides one that learns."""
+    train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
+    """Values for arguments of ``train`` that its caller leaves out."""
+    predicates: Mapping[str, Any] = field(default_factory=dict)
+    """Words for missions as texts (``Run.plan``): functions of observations or of a ``Step``, by
+    name. The name of each skill is such a word already: its ``success``."""
+    features: Any = None
+    """By what plans compare observations, as for ``planning.Planner``: a function of observations
+    (n, …) to numbers (n, F), or a dict of these by skill. Skills that see images need it."""
+    name: str = "hierarchy"
+    """Its name where it is a skill of another hierarchy."""
+
+    @checked_names
+    def train(
+        self,
+        run_dir: str | Path | None = None,
+        *,
+        resume: bool = False,
+        overwrite: bool = False,
+        seed: int = 0,
+        eval_every: int | None = None,
+        eval_episodes: int | None = None,
+        checkpoint_every: int | None = None,
+        keep: Literal["last", "best"] | None = None,
+        log_info: Sequence[str] | None = None,
+        log_calls: int | None = None,
+        log_calls_info: Sequence[str] | None = None,
+        quiet: bool = False,
+        callback: Callback | None = None,
+        evolve: Evolve = None,
+        cluster: Ray | None = None,
+        track: str | Sequence[str] = (),
+        start_from: StartFrom = None,
+        flat: bool | AlgorithmConfig = False,
+    ) -> Run:
         """Train skills and selector and write everything to ``run_dir``.
 
         Of evaluations, checkpoints and logs, None is what ``train_defaults`` says.
+
+        Args:
+            run_dir: a new directory; None: the next number of ``runs/<name>-<n>``, named after the
+                recipe, the hierarchy or the environment. A run that has saved nothing yet is
+                replaced, unless a process trains it; any other only with ``overwrite``.
+            resume: continue the run in this directory if it has learnt something, else start one.
+                It keeps its settings, and a message lists those that differ. If steps have grown,
+                a finished run continues: in new episodes, with schedules over the new budget.
+                Steps of stages whose learners learn again in a later one go to that stage.
+            overwrite: replace the run in this directory, also a finished one; not with
+                ``resume``. Files there that no run writes stay.
+            seed: the root of every random stream.
+            eval_every: environment steps between evaluations while training, by the learner's own
+                reward; by default there are none. Their results are ``eval_return`` and
+                ``eval_success`` in ``metrics.jsonl``.
+            eval_episodes: episodes of each of these evaluations, by default 20.
+            checkpoint_every: environment steps between checkpoints, by default 100,000.
+            keep: "best": each stage ends with the weights whose periodic evaluation was best, by
+                the mean return or by what its target is of; the last weights are evaluated, too.
+                It needs ``eval_every``. A population ends with its best member in any case. By
+                default "last".
+            log_info: keys of ``info``: the mean of each over the latest 100 episodes is
+                ``info/<key>`` in ``metrics.jsonl`` and in trackers. Each episode counts with the
+                value in its last step (in a skill's own stage, its call's). None, NaN and
+                infinity are left out.
+            log_calls: steps: the calls in the last steps in which the selector acted, this many,
+                are the run's log of calls afterwards, as if ``Run.log_calls`` had recorded them;
+                so ``Run.plan`` needs no further steps. Calls that are open at the end are left
+                out. Skills that learnt in these steps have changed since: ``handover`` may count
+                their calls, but ``plan`` refuses them. A run that was interrupted logs the calls
+                after it was continued. Nothing else changes. By default there is no log.
+            log_calls_info: keys of ``info`` to record with the calls.
+            quiet: no progress.
+            callback: a function that is called with a ``TrainEvent`` for each report of training
+                and each checkpoint. Where it returns False, the stage ends with what it has
+                learnt, as at a target, and the next one starts. An exception in it stops the
+                training and leaves ``train`` unchanged; the run can be resumed from its last
+                checkpoint. It is called in this process, and is not stored in the run.
+            evolve: a population for every stage, or for some by name (a skill's, "selector",
+                "agent"). Its budget is the stage's for each member, measuring fitness included.
+                Skills and selector of a population cannot learn together yet: they learn apart. A
+                run that continues needs it only where the population evolves by a selection of
+                your own.
+            cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
+                where it pays. A run that continues keeps their number.
+            track: any of "tensorboard", "wandb" and "mlflow": one, or a list.
+            start_from: another run, or its directory: a learner that has learnt there, by the same
+                name, starts with its policy. Or several runs, by learner: ``{"left": run,
+                "right": other}``; a run of a plain agent fits any name. The policy is copied (of
+                PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
+                spaces, networks and the names of a selector's skills must be the same. In place of
+                a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
+            flat: train one plain agent for the same number of steps instead: the baseline. True:
+                with the settings of ``train_defaults``; or its settings.
 
         Returns:
             The finished run.
@@ -210,6 +453,26 @@ class Hierarchy(Trainable, Declaration):
             RunError: ``run_dir`` holds something else, or no learner can start from
                 ``start_from``.
         """
+        options = TrainOptions(
+            run_dir,
+            resume=resume,
+            overwrite=overwrite,
+            seed=seed,
+            eval_every=eval_every,
+            eval_episodes=eval_episodes,
+            checkpoint_every=checkpoint_every,
+            keep=keep,
+            log_info=log_info,
+            log_calls=log_calls,
+            log_calls_info=log_calls_info,
+            quiet=quiet,
+            callback=callback,
+            evolve=evolve,
+            cluster=cluster,
+            track=track,
+            start_from=start_from,
+            flat=flat,
+        )
         return run_of(train(self, options))
 
     def plain_agent(self, algorithm: AlgorithmConfig | None = None) -> Agent:
@@ -587,7 +850,18 @@ class TrainedPolicy:
         return self._calls.has_any()
 
     @checked_names
-    def plan(self, task: Any, log: CallLog | None = None, **settings: Any) -> PlannedRun:
+    def plan(
+        self,
+        task: Any,
+        log: CallLog | None = None,
+        *,
+        predicates: Mapping[str, Any] | None = None,
+        features: Any = None,
+        neighbors: int = 5,
+        gamma: float = 0.999,
+        caution: float = 0.03,
+        temperature: float = 0.0,
+    ) -> PlannedRun:
         """Return the skills with a selector that plans a new task on logged calls; no training.
 
         Evaluations, films and players are about the task: its reward, its end, its success. Nothing
@@ -597,28 +871,41 @@ class TrainedPolicy:
             task: a ``planning.Mission`` or its text, a ``RewardMachine``, a ``GoalTask``, a
                 predicate, or a function of a ``Step`` that returns the reward.
             log: calls of these skills; None: all that ``log_calls`` recorded in this run.
-            **settings: of ``planning.Planner``: ``gamma``; ``features``, by default the
-                hierarchy's; ``predicates`` for a text, beside the hierarchy's own and the names of
-                its skills, which mean their success.
+            predicates: by name, for a text, beside the hierarchy's own and the names of its
+                skills, which mean their success.
+            features: by what calls are near one another; None: the hierarchy's ``features``.
+            neighbors: nearest logged calls of each choice that are compared.
+            gamma: γ of one step.
+            caution: the share by which a value falls, about, where the nearest call is as far as
+                the last of the ``neighbors`` usually is.
+            temperature: choices are sampled by exp(Q / (temperature · the largest |Q|)); 0: the
+                best is chosen.
 
         Raises:
             DeclarationError: this is a plain agent, or a setting is wrong.
             RunError: there is no log, it is of other skills, or no step of it does what the task
                 needs.
         """
-        if "skills" in settings:
-            raise DeclarationError("plan() takes no skills: they are the run's own")
         declared = self.hierarchy
         if log is None:
             log = self.calls
         elif isinstance(log, CallLog):
             log.check_environment(self._own_spec())
         if isinstance(task, str):
-            words = settings.get("predicates") or {}
+            words = {} if predicates is None else predicates
             if isinstance(words, Mapping):  # else the planner says what it is
-                settings["predicates"] = mission_words(declared, words)
-        settings.setdefault("features", declared.features)
-        planner = Planner(log, task, skills=self.policy, **settings)
+                predicates = mission_words(declared, words)
+        planner = Planner(
+            log,
+            task,
+            predicates=predicates,
+            skills=self.policy,
+            features=declared.features if features is None else features,
+            neighbors=neighbors,
+            gamma=gamma,
+            caution=caution,
+            temperature=temperature,
+        )
         hierarchy, policy = planned(declared, self.policy, planner)
         run = PlannedRun(hierarchy, self.path, policy)
         # Each goal of its own would need a plan of its own now.
@@ -768,8 +1055,21 @@ class Run(TrainedPolicy):
         run = RunDirectory.open(self.path)
         return info_json(run, load_evaluations(run), handover_of(run))
 
-    @Takes(RepairOptions)
-    def repair(self, options: RepairOptions) -> Run:
+    @checked_names
+    def repair(
+        self,
+        skill: str,
+        *,
+        after: str,
+        steps: int | None = None,
+        run_dir: str | Path | None = None,
+        done: Mapping[str, Any] | None = None,
+        calls: int = 200,
+        seed: int = 0,
+        resume: bool = False,
+        quiet: bool = False,
+        callback: Callback | None = None,
+    ) -> Run:
         """Train a skill on from where another one ends, and keep the result if it is better.
 
         Most episodes begin after a call of the other skill, the others as usual; half of them where
@@ -782,6 +1082,20 @@ class Run(TrainedPolicy):
         and no other one clearly worse. All other weights stay as they are. What was done is in
         ``Run.repairs``.
 
+        Args:
+            skill: the skill that fails, by its path.
+            after: the skill after which it fails, of the same selector.
+            steps: environment steps of training; measuring takes more. None: 200,000.
+            run_dir: a new directory; None: the next number of ``runs/<name>-repair-<n>``.
+            done: by skill, the event that a call is for, in place of the skill's ``success``; as
+                for ``planning.handover``.
+            calls: calls of the pair to measure at least, before and after; fewer where 500,000
+                steps do not hold them.
+            seed: the root of every random stream.
+            resume: finish the repair in ``run_dir``, with its own steps and settings.
+            quiet: no progress.
+            callback: see ``Hierarchy.train``.
+
         Returns:
             The new run, with the repaired weights or the earlier ones.
 
@@ -793,6 +1107,18 @@ class Run(TrainedPolicy):
         """
         declared = self.hierarchy
         assert isinstance(self.policy, HierarchyPolicy)
+        options = RepairOptions(
+            skill,
+            after,
+            steps=steps,
+            run_dir=run_dir,
+            done=done,
+            calls=calls,
+            seed=seed,
+            resume=resume,
+            quiet=quiet,
+            callback=callback,
+        )
         return run_of(repair(declared, self.path, self.policy, options))
 
     @property
@@ -936,9 +1262,82 @@ def _labels_of(
     return label
 
 
-@Takes(AgentTraining)
-def train_agent(options: AgentTraining) -> Run:
+@checked_names
+def train_agent(
+    env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec,
+    algorithm: AlgorithmConfig,
+    steps: int,
+    run_dir: str | Path | None = None,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    seed: int = 0,
+    eval_every: int | None = None,
+    eval_episodes: int | None = None,
+    checkpoint_every: int | None = None,
+    keep: Literal["last", "best"] | None = None,
+    log_info: Sequence[str] | None = None,
+    quiet: bool = False,
+    callback: Callback | None = None,
+    evolve: Evolve = None,
+    cluster: Ray | None = None,
+    track: str | Sequence[str] = (),
+    start_from: StartFrom = None,
+    target_return: float | None = None,
+    target_success: float | None = None,
+) -> Run:
     """Train one plain agent on an environment's own reward; the run is like any other.
+
+    Args:
+        env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
+        algorithm: its settings, ``SAC()`` for example.
+        steps: training budget in environment steps.
+        run_dir: a new directory; None: the next number of ``runs/<name>-<n>``, named after the
+            recipe, the hierarchy or the environment. A run that has saved nothing yet is
+            replaced, unless a process trains it; any other only with ``overwrite``.
+        resume: continue the run in this directory if it has learnt something, else start one.
+            It keeps its settings, and a message lists those that differ. If steps have grown,
+            a finished run continues: in new episodes, with schedules over the new budget.
+            Steps of stages whose learners learn again in a later one go to that stage.
+        overwrite: replace the run in this directory, also a finished one; not with
+            ``resume``. Files there that no run writes stay.
+        seed: the root of every random stream.
+        eval_every: environment steps between evaluations while training, by the learner's own
+            reward; by default there are none. Their results are ``eval_return`` and
+            ``eval_success`` in ``metrics.jsonl``.
+        eval_episodes: episodes of each of these evaluations, by default 20.
+        checkpoint_every: environment steps between checkpoints, by default 100,000.
+        keep: "best": each stage ends with the weights whose periodic evaluation was best, by
+            the mean return or by what its target is of; the last weights are evaluated, too.
+            It needs ``eval_every``. A population ends with its best member in any case. By
+            default "last".
+        log_info: keys of ``info``: the mean of each over the latest 100 episodes is
+            ``info/<key>`` in ``metrics.jsonl`` and in trackers. Each episode counts with the
+            value in its last step (in a skill's own stage, its call's). None, NaN and
+            infinity are left out.
+        quiet: no progress.
+        callback: a function that is called with a ``TrainEvent`` for each report of training
+            and each checkpoint. Where it returns False, the stage ends with what it has
+            learnt, as at a target, and the next one starts. An exception in it stops the
+            training and leaves ``train`` unchanged; the run can be resumed from its last
+            checkpoint. It is called in this process, and is not stored in the run.
+        evolve: a population for every stage, or for some by name (a skill's, "selector",
+            "agent"). Its budget is the stage's for each member, measuring fitness included.
+            Skills and selector of a population cannot learn together yet: they learn apart. A
+            run that continues needs it only where the population evolves by a selection of
+            your own.
+        cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
+            where it pays. A run that continues keeps their number.
+        track: any of "tensorboard", "wandb" and "mlflow": one, or a list.
+        start_from: another run, or its directory: a learner that has learnt there, by the same
+            name, starts with its policy. Or several runs, by learner: ``{"left": run,
+            "right": other}``; a run of a plain agent fits any name. The policy is copied (of
+            PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
+            spaces, networks and the names of a selector's skills must be the same. In place of
+            a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
+        target_return: stop early at this mean return of the periodic evaluation.
+        target_success: stop early at this share of episodes with a true ``info["success"]``, or
+            ``info["is_success"]`` where that is missing.
 
     Returns:
         The finished run.
@@ -946,8 +1345,24 @@ def train_agent(options: AgentTraining) -> Run:
     Raises:
         DeclarationError: the algorithm cannot act in the environment; the message names others.
     """
-    targets = options.target_return, options.target_success
-    agent = Agent(options.env, options.algorithm, options.steps, *targets)
+    options = TrainOptions(
+        run_dir,
+        resume=resume,
+        overwrite=overwrite,
+        seed=seed,
+        eval_every=eval_every,
+        eval_episodes=eval_episodes,
+        checkpoint_every=checkpoint_every,
+        keep=keep,
+        log_info=log_info,
+        quiet=quiet,
+        callback=callback,
+        evolve=evolve,
+        cluster=cluster,
+        track=track,
+        start_from=start_from,
+    )
+    agent = Agent(env, algorithm, steps, target_return, target_success)
     with called_by("train_agent"):
         return run_of(train(agent, options))
 

@@ -11,7 +11,7 @@ from skillweave.api import Agent, Hierarchy, Run, run_of
 from skillweave.api.applying import load_policy
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.running import begin, begun
-from skillweave.api.train_options import AgentOptions
+from skillweave.api.train_options import TrainOptions
 from skillweave.errors import DeclarationError, RunError
 from skillweave.runs import hub
 from skillweave.runs.command_words import python_string
@@ -108,7 +108,7 @@ def finish(declared: Hierarchy, content: Manifest, run_dir: Path) -> Run:
     """
     run = begun(declared, content, run_dir)
     if run is None:
-        options = AgentOptions(run_dir, seed=content.seed, quiet=True)
+        options = TrainOptions(run_dir, seed=content.seed, quiet=True)
         return run_of(begin(declared, content, options))
     return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)
 

@@ -16,11 +16,10 @@ from skillweave._internal.notices import collected_notices, warn
 from skillweave._internal.paths import AGENT
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave._internal.terminal import steady_streams
-from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.api.applying import D, Trained, apply_manifest, differences
 from skillweave.api.continuing import prepared, to_continue
 from skillweave.api.starting import starts
-from skillweave.api.train_options import AgentOptions, Going, ResumeOptions, TrainOptions
+from skillweave.api.train_options import TrainOptions
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.evolution.evolving import check_several, make_learner, plan
@@ -60,18 +59,16 @@ def _may_train() -> None:
         )
 
 
-def train(declared: D, options: AgentOptions) -> Trained[D]:
+def train(declared: D, options: TrainOptions) -> Trained[D]:
     """Check everything, start a run, or continue the one that is there, and train it."""
     declared.validate()
-    flat: bool | AlgorithmConfig = False
+    flat = options.flat
     note = ""
     evolve = options.evolve
-    if isinstance(options, TrainOptions):
-        flat = options.flat
-        if flat is not False and options.log_calls is not None:
-            raise DeclarationError(
-                "flat trains one plain agent, which has no skills to call: leave out log_calls"
-            )
+    if flat is not False and options.log_calls is not None:
+        raise DeclarationError(
+            "flat trains one plain agent, which has no skills to call: leave out log_calls"
+        )
     how = declared.train_defaults.given(options)
     by_stage = evolve if isinstance(evolve, Mapping) else {"": evolve}
     if isinstance(declared, Declaration) and flat is False and any(by_stage.values()):
@@ -83,7 +80,7 @@ def train(declared: D, options: AgentOptions) -> Trained[D]:
 def begin(
     declared: D,
     content: Manifest,
-    options: AgentOptions,
+    options: TrainOptions,
     note: str = "",
     repair: First | None = None,
     done: Mapping[str, Any] | None = None,
@@ -100,7 +97,12 @@ def begin(
     # An environment may change the working directory as it is made.
     given = options.run_dir
     place = absolute("." if given is None else as_path(given, "run_dir"))
-    content = replace(content, recipe=content.recipe or declared.recipe, **options.for_manifest())
+    content = replace(
+        content,
+        recipe=content.recipe or declared.recipe,
+        seed=options.seed,
+        track=tuple(options.track),
+    )
     with _training(declared) as stack:
         roles = _plan(declared, content, options)
         if options.resume and (run := to_continue(place)) is not None:
@@ -140,7 +142,7 @@ def _run_name(declared: Declared, content: Manifest) -> str:
     flat = ""
     if isinstance(declared, Declaration):
         flat = "-flat" if content.hierarchy is None else ""
-        name = name if declared.name == Declaration.name else declared.name
+        name = name if declared.name == type(declared).name else declared.name
     return (Path(content.recipe or "").stem or name) + flat
 
 
@@ -158,7 +160,7 @@ def begun(declared: Declaration, content: Manifest, run_dir: Path) -> RunDirecto
     if not (run_dir / "run.json").exists():
         return None
     run, content = RunDirectory.open(run_dir), copy.deepcopy(content)
-    _plan(declared, content, Going())
+    _plan(declared, content, TrainOptions())
     grown = any(stage.continued for stage in run.manifest.stages)
     if grown or run.manifest.id != identity(content):
         raise RunError(
@@ -169,7 +171,7 @@ def begun(declared: Declaration, content: Manifest, run_dir: Path) -> RunDirecto
 
 
 @global_generators(Seeds(0) / "plan")  # environments are made, and timed
-def _plan(declared: Declared, content: Manifest, options: Going) -> Mapping[str, Role]:
+def _plan(declared: Declared, content: Manifest, options: TrainOptions) -> Mapping[str, Role]:
     """Check everything, and complete the entries of a manifest's stages; return the roles."""
     stages = [stage for stage in content.stages if not stage.done]
     spec, cluster = declared.spec, options.cluster
@@ -227,9 +229,10 @@ def _must_not_run_again(spec: EnvSpec) -> None:
         )
 
 
-def resume(declared: D, options: ResumeOptions) -> Trained[D]:
+def resume(declared: D, options: TrainOptions) -> Trained[D]:
     """Finish a run with its own settings; a message lists those that differ."""
     declared.validate()
+    assert options.run_dir is not None
     run = RunDirectory.open(as_path(options.run_dir, "run_dir"))
     applied = apply_manifest(declared, run)
     note = ""
@@ -242,7 +245,7 @@ def resume(declared: D, options: ResumeOptions) -> Trained[D]:
 def go_on(
     declared: D,
     run: RunDirectory,
-    options: Going,
+    options: TrainOptions,
     note: str = "",
     done: Mapping[str, Any] | None = None,
 ) -> Trained[D]:

@@ -13,8 +13,6 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
-from skillweave.training.options import Continuing, Starting
-
 Out = Annotated[Path, arg(aliases=["-o"])]
 """A place to write to."""
 MaybeOut = Annotated[Path | None, arg(aliases=["-o"])]
@@ -83,13 +81,20 @@ class OnRay(Output):
 
 
 @dataclass(frozen=True)
-class TrainCommand(OnRay, Continuing, Starting):
+class TrainCommand(OnRay):
     """Train a recipe: every skill, then the selector."""
 
     recipe: Positional[str] = tyro.MISSING
     """A shipped recipe (skillweave list), or a Python file that defines a Hierarchy."""
     out: MaybeOut = None
     """A new directory for the run; default: the next number of runs/NAME-N."""
+    resume: bool = False
+    """Continue the run in this directory, or start one; with more steps (--scale, --set steps=N)
+    also a finished one."""
+    overwrite: bool = False
+    """Replace the run in this directory, also a finished one."""
+    seed: int = 0
+    """The root of every random stream."""
     flat: bool = False
     """Train one plain agent on the same number of steps instead: the baseline."""
     versus_flat: bool = False
@@ -133,7 +138,7 @@ class DemoCommand(Output):
 
 
 @dataclass(frozen=True)
-class ResumeCommand(OnRay, Coded, OfRun, Continuing):
+class ResumeCommand(OnRay, Coded, OfRun):
     """Finish a run that was stopped; the end is the same as if it had not been."""
 
     evaluate: int = 100

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 
 from skillweave._internal.messages import ELSEWHERE, suggest
-from skillweave.training.options import Reports
+from skillweave.training.defaults import AGENT_DEFAULTS
 
 COMMANDS = {
     "enjoy": "evaluate, or render for a film",
@@ -106,7 +106,7 @@ def _way(option: str, trains: bool) -> str | None:
         return way
     setting = option.replace("-", "_")
     setting = ELSEWHERE.get(setting, setting)
-    if any(setting == field.name for field in fields(Reports)):
+    if setting in AGENT_DEFAULTS:
         return f"--set train.{setting}=VALUE"
     if setting in SETTINGS:
         return f"--set selector.{setting}=VALUE, and --set skills.NAME.{setting}=VALUE for a skill"

@@ -67,7 +67,7 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
         names.append(name)
         head, *rest = path = name.split(".")
         if head in PLAIN and not rest:
-            hint = annotations_of(Declaration)[head]
+            hint = annotations_of(type(declaration))[head]
             setattr(declaration, head, _parse(name, text, hint))
         elif head == "skills" and len(rest) == 2 and rest[1] in OF_SKILLS:
             hint = annotations_of(Skill)[rest[1]]

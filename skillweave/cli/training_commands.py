@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.config import Evolution
 from skillweave.runs.directory import RunDirectory
 from skillweave.schema import Count, as_json, fitted
-from skillweave.training.options import Continuing, Starting
 from skillweave.workers.cluster import Ray
 
 
@@ -66,7 +65,7 @@ def resume(command: commands.ResumeCommand) -> Result:
     declared = declared_by(run, command.recipe, to_train=True)
     cluster = None if command.ray is None else Ray(address=command.ray or None)
     with _interruptible(command.ray):
-        trained = declared.resume(command.run, **_options(command, Continuing), cluster=cluster)
+        trained = declared.resume(command.run, quiet=command.quiet, cluster=cluster)
     result, lines = _summary(command, trained)
     return result, "\n".join(lines)
 
@@ -84,7 +83,10 @@ def _trained(
         cluster = None if command.ray is None else Ray(command.collectors, command.ray or None)
         return hierarchy.train(
             out,
-            **_options(command, Starting, Continuing),
+            resume=command.resume,
+            overwrite=command.overwrite,
+            seed=command.seed,
+            quiet=command.quiet,
             flat=flat,
             track=command.track,
             evolve=evolve,
@@ -93,11 +95,6 @@ def _trained(
             keep=command.keep,
             log_info=command.log_info or None,
         )
-
-
-def _options(command: Any, *kinds: Any) -> dict[str, Any]:
-    """Return the options of training that a command takes as they are."""
-    return {f.name: getattr(command, f.name) for kind in kinds for f in fields(kind)}
 
 
 def _start_from(words: Sequence[str]) -> str | dict[str, str] | None:

@@ -12,7 +12,7 @@ from skillweave.algorithms.config import PPO, AlgorithmSettings
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.roles import Level, Nestable, Roles
-from skillweave.hierarchy.settings import Guide, Settings
+from skillweave.hierarchy.settings import USUAL_CALL_STEPS, Guide
 from skillweave.runs.manifest import Target
 from skillweave.schema import fitted
 from skillweave.skills import Automaton, Skill, ready_policy
@@ -163,7 +163,7 @@ def _check_calls(level: Level) -> None:
     """
     if level.call_steps is not None:
         for skill in level.skills.values():
-            if level.call_steps == Settings.call_steps and _undoes_call_steps(skill):
+            if level.call_steps == USUAL_CALL_STEPS and _undoes_call_steps(skill):
                 notice(
                     f"skill {skill.name!r}: call_steps = None lifts no limit of its calls: "
                     f"it means the hierarchy's call_steps, {level.call_steps}. For calls that last "

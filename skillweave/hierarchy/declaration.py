@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
-from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, suggest
 from skillweave._internal.paths import AGENT, CRITIC, SELECTOR, join
 from skillweave.algorithms.config import AlgorithmConfig, AlgorithmSettings
@@ -21,42 +20,49 @@ from skillweave.hierarchy.checks import (
 from skillweave.hierarchy.fitting import check_settings, ready_policies, ready_selectors
 from skillweave.hierarchy.roles import Level, Nestable, Roles, hierarchies_of, roles_of
 from skillweave.hierarchy.schedule import DEFAULT_STEPS, budgets_of, stages_of
-from skillweave.hierarchy.settings import Settings, settings_in
+from skillweave.hierarchy.settings import (
+    Apart,
+    CallSteps,
+    Guide,
+    Learn,
+    Selection,
+    SelectorValue,
+    settings_in,
+)
 from skillweave.networks.config import seeing_all
 from skillweave.planning.neighbors import check_features
 from skillweave.planning.predicates import named_predicates
 from skillweave.schema import Positive, check_fields, fitted
-from skillweave.skills import Skill, is_trained
+from skillweave.skills import Reflex, Skill, is_trained
 from skillweave.spaces import action_codec, obs_codec
-from skillweave.training.defaults import TrainDefaults
 from skillweave.training.env_check import check_env
 from skillweave.training.plain_agent import Declared, PlainAgent
-from skillweave.training.stage import TOGETHER, Stage
+from skillweave.training.stage import TOGETHER, Stage, Together
 
 D = TypeVar("D", bound="Declaration")
 RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT)
 """Names of stages that are not skills."""
 
 
-@checked_names
-@dataclass
-class Declaration(Settings, Nestable, Declared):
-    """Skills, reflexes and a selector on one environment, with budgets in environment steps.
+class Declaration(Nestable, Declared):
+    """The declaration of a hierarchy: checks, stages and budgets.
 
-    Raises:
-        DeclarationError: the declaration is wrong; the message names the skill and the field.
+    ``Hierarchy`` describes its settings, and has their defaults.
     """
 
-    train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
-    """Values for arguments of ``train`` that its caller leaves out."""
-    predicates: Mapping[str, Any] = field(default_factory=dict)
-    """Words for missions as texts (``Run.plan``): functions of observations or of a ``Step``, by
-    name. The name of each skill is such a word already: its ``success``."""
-    features: Any = None
-    """By what plans compare observations, as for ``planning.Planner``: a function of observations
-    (n, …) to numbers (n, F), or a dict of these by skill. Skills that see images need it."""
-    name: str = "hierarchy"
-    """Its name where it is a skill of another hierarchy."""
+    call_steps: CallSteps
+    steps: int | None
+    learn: Learn
+    algorithm: AlgorithmConfig
+    selector: SelectorValue
+    reflexes: Sequence[Reflex]
+    rest: Any
+    apart: Apart
+    together: Together
+    selection: Selection
+    guide: Guide | None
+    predicates: Mapping[str, Any]
+    features: Any
     _caller = "hierarchy"
 
     def validate(self) -> None:

@@ -46,20 +46,13 @@ _OF_SKILL = ("call_steps", "max_steps", "color")
 """Attributes of a skill that a hierarchy may be given."""
 
 
-@dataclass
-class OfSkills:
-    """The declaration of something that has skills."""
-
-    skills: Sequence[Skill]
-    """The skills that the selector chooses from; a hierarchy among them is trained inside."""
-
-
-class Nestable(OfSkills):
+class Nestable:
     """The declaration of a hierarchy, as the table is made from it; it may be a skill of another.
 
     ``Declaration`` has the settings.
     """
 
+    skills: Sequence[Skill]
     name: str
 
     def as_skill(self, name: str | None = None, **attributes: Any) -> Skill:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal
 
-from skillweave.algorithms.config import PPO, AlgorithmConfig, AlgorithmSettings
+from skillweave.algorithms.config import AlgorithmConfig, AlgorithmSettings
 from skillweave.errors import DeclarationError
 from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, settings
 from skillweave.skills import Reflex
 from skillweave.skills.lengths import Lengths
-from skillweave.skills.own_part import ZERO
 from skillweave.skills.selector import ReadyValue
 from skillweave.training.stage import Together
 
@@ -114,44 +113,32 @@ SelectorValue = Annotated[
     ),
 ]
 """A selector that is trained, or a ready one."""
+Learn = Literal["together", "apart", "apart, then together"]
+"""Which of skills and selector learn from the same steps."""
+USUAL_CALL_STEPS = 40
+"""The default of ``Hierarchy.call_steps``."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Settings:
-    """Settings of a hierarchy, the outermost one or one that is a skill of another."""
+    """Settings of a hierarchy, the outermost one or one that is a skill of another.
 
-    call_steps: CallSteps = 40
-    """Steps of a skill before the selector decides again; None: until the skill ends by itself."""
-    steps: AtLeastOne | None = None
-    """Training steps in all, split by ``learn``; None: 1,000,000. A budget that a skill, ``apart``
-    or ``together`` sets replaces that part and leaves the others as they are; where all parts are
-    set, leave this out."""
-    learn: Literal["together", "apart", "apart, then together"] = "together"
-    """Train skills and selector from the same steps ("together"); or skills one by one, then the
-    selector ("apart"); or one after the other, half of the steps each. Where no skill learns, the
-    selector trains alone."""
-    algorithm: AlgorithmSettings = field(default_factory=PPO)
-    """The algorithm of every skill that sets no other."""
-    selector: SelectorValue = field(default_factory=PPO)
-    """The algorithm of the selector; its γ and n_steps count environment steps. Or a ready
-    selector, not trained: a function of observations, an ``Automaton``, or a ``tree.Sequence``."""
-    reflexes: Sequence[Reflex] = ()
-    """Rules that override the running skill's action, also while skills train."""
-    rest: Any = ZERO
-    """The numbers of an action that the running skill does not write (``Skill.acts``): "zero";
-    "hold", as they were in the last action, zero in an episode's first; a number; or a list with a
-    number or "hold" for each number of the action, a dict of these for a Dict action. Zero is what
-    pushes nothing where actions are forces or speeds; hold what is a place, or a grip."""
-    apart: Apart = field(default_factory=Apart)
-    """Settings of learning apart: budgets, and the start of skills."""
-    together: Together = field(default_factory=Together)
-    """Settings of learning together: budget, the task's weight, interruption, exploration."""
-    selection: Selection = field(default_factory=Selection)
-    """Settings of the selector's choices: cost of a call, greedy or sampling."""
-    guide: Guide | None = None
-    """A ready selector that guides one that learns."""
+    ``Hierarchy`` describes them, and has their defaults.
+    """
+
+    call_steps: CallSteps
+    steps: AtLeastOne | None
+    learn: Learn
+    algorithm: AlgorithmSettings
+    selector: SelectorValue
+    reflexes: Sequence[Reflex]
+    rest: Any
+    apart: Apart
+    together: Together
+    selection: Selection
+    guide: Guide | None
 
 
-def settings_in(one: Settings) -> dict[str, Any]:
-    """Return the settings that a declaration, or a level, has."""
+def settings_in(one: Any) -> dict[str, Any]:
+    """Return the settings of a declaration, or of a level, by name."""
     return {f.name: getattr(one, f.name) for f in fields(Settings)}

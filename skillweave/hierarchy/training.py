@@ -28,8 +28,7 @@ from skillweave.runs.trackers import Listener
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import as_recorded
 from skillweave.training.agents import Agents
-from skillweave.training.defaults import TrainDefaults
-from skillweave.training.options import CallReports
+from skillweave.training.defaults import HIERARCHY_DEFAULTS, TrainDefaults
 from skillweave.training.plain_agent import Declared, PlainAgent
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_run import MakeLearner
@@ -74,7 +73,7 @@ def manifest(
         stages=[stage.entry() for stage in stages],
         needs_recipe=code or not roles.is_data,
         resume_needs_recipe=learns or not roles.trains_from_data,
-        **how.entries(CallReports),
+        **how.entries(HIERARCHY_DEFAULTS),
     )
 
 

@@ -19,25 +19,17 @@ from skillweave.runs.manifest import Manifest
 from skillweave.runs.user_code import environment_texts
 from skillweave.schema import AtLeastOne, Share, check_fields
 from skillweave.spaces import action_codec
-from skillweave.training.defaults import TrainDefaults
+from skillweave.training.defaults import AGENT_DEFAULTS, TrainDefaults
 from skillweave.training.env_check import EnvValue, check_env, check_rollout
 from skillweave.training.learning_task import skill_task
-from skillweave.training.options import Reports
 from skillweave.training.role import agent_role
 from skillweave.training.stage import Stage, target_of
 
 
-@dataclass
-class InEnv:
-    """The declaration of something that acts in an environment."""
-
-    env: EnvValue
-    """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
-
-
-class Declared(InEnv, ABC):
+class Declared(ABC):
     """The declaration of a hierarchy, or of a plain agent."""
 
+    env: EnvValue
     train_defaults: TrainDefaults
     _caller: ClassVar[Caller]
     """The entry point in lines of Python that messages print."""
@@ -91,6 +83,8 @@ class PlainAgent(Declared):
         DeclarationError: a setting is wrong; the message names it.
     """
 
+    env: EnvValue
+    """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
     algorithm: AlgorithmSettings
     """The algorithm's settings."""
     steps: AtLeastOne
@@ -157,7 +151,7 @@ class PlainAgent(Declared):
             stages=[stage.entry()],
             needs_recipe=code,
             resume_needs_recipe=code or stage.learns_by_code or self.spec.engine != "auto",
-            **how.entries(Reports),
+            **how.entries(AGENT_DEFAULTS),
         )
 
 

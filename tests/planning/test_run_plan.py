@@ -112,7 +112,7 @@ def test_what_cannot_be_planned_is_refused(run, log, tmp_path):
     ):
         with pytest.raises(RunError, match="this run was planned, so nothing of it is written"):
             written()
-    with pytest.raises(DeclarationError, match="plan\\(\\) takes no skills"):
+    with pytest.raises(DeclarationError, match="has no argument 'skills'"):
         run.plan(at_four, log, skills=run.policy)
     with pytest.raises(DeclarationError, match="'four' is no known predicate; there are: open"):
         run.plan("four", log)
