@@ -326,7 +326,7 @@ class LevelLearners:
         part = level.skill_set.part(i)
         goals = level.hierarchy.goals.get(i)
         path = level.path + skill.name
-        own = OwnSteps.called(trace, level.path, skill, acts)
+        own = OwnSteps.of_skill(trace, level.path, skill, acts)
         steps = own.rows(end)
         # Elsewhere it is called again at once.
         ends = trace.ended | own.timed_out
@@ -344,7 +344,7 @@ class LevelLearners:
     ) -> tuple[LearningLevel, Batch, Array, Array]:
         """Judge a skill that is a hierarchy; return the arguments of ``_of_level`` for it."""
         below = level.below[i]
-        own = OwnSteps.called(trace, level.path, level.skills[i], acts)
+        own = OwnSteps.of_skill(trace, level.path, level.skills[i], acts)
         steps = own.rows(end)
         over = trace.ended
         ended = trace[below.path + "call_end"]

@@ -16,7 +16,7 @@ from skillweave.envs.engine import Engine
 from skillweave.envs.env_infos import allowed_rows, random_actions
 from skillweave.errors import TrainingError
 from skillweave.policies.core import RUNNING, Turn, World, flat, observed, part_of, restart
-from skillweave.skills import Skill, asked
+from skillweave.skills import Skill, call_method
 from skillweave.skills.skill_set import SkillSet, acting_policy, within
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.types import Array, Step
@@ -268,7 +268,7 @@ class Search:
             return ids
         holds = np.ones(len(ids), bool)
         if self._restricted:
-            holds = asked(self.skill, "initiation", obs[ids], ids)
+            holds = call_method(self.skill, "initiation", obs[ids], ids)
         found = ids[holds & (self.kept["calls_left"][ids] == 0)]
         waiting = ids[~holds]
         self.kept["searching"][found] = False

@@ -17,7 +17,7 @@ from skillweave.algorithms.batches import OF_STEP, Batch, Trace
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.policies.core import OWN, RUNNING, own_step, part_of
 from skillweave.policies.infos import Infos
-from skillweave.skills import Skill, asked
+from skillweave.skills import Skill, call_method
 from skillweave.skills.goals import Goals, check_reads_goal
 from skillweave.skills.outputs import missing_key
 from skillweave.skills.own_part import OwnPart
@@ -52,7 +52,7 @@ def stops(skill: Skill, step: Step, ids: Array) -> Array:
     """
     if not skill.defines("termination"):
         return np.zeros(len(ids), bool)
-    return asked(skill, "termination", step, ids)
+    return call_method(skill, "termination", step, ids)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class OwnSteps:
     """(T, N, *goal_shape) of its calls; None: it has no goals."""
 
     @classmethod
-    def called(cls, trace: Trace, path: str, skill: Skill, acts: Array) -> OwnSteps:
+    def of_skill(cls, trace: Trace, path: str, skill: Skill, acts: Array) -> OwnSteps:
         """Return the steps of a skill that is called; ``path`` begins its level's columns."""
         goal = trace.get(f"{path}{skill.name}/goal")
         return cls(trace, skill, acts, trace[path + "call_elapsed"], goal)
@@ -145,7 +145,7 @@ class OwnSteps:
             step = _step({name: flat(self.trace[name]) for name in OF_STEP}, elapsed, info)
             seen = seen_by(skill, step, elapsed, goal=goal)
             try:
-                found = asked(skill, what, seen, np.nonzero(acts)[1])
+                found = call_method(skill, what, seen, np.nonzero(acts)[1])
             except SkillweaveError:
                 pass  # it is raised below, by the step that it is of
             else:
@@ -154,7 +154,7 @@ class OwnSteps:
         each: list[Array] = [np.zeros(0, bool)]
         for t in steps:
             ids = np.flatnonzero(acts[t])
-            each.append(asked(skill, what, self._alone(skill, part.start + t, ids), ids))
+            each.append(call_method(skill, what, self._alone(skill, part.start + t, ids), ids))
         return np.concatenate(each)
 
     def _alone(self, skill: Skill, t: int, ids: Array) -> Step:
@@ -187,7 +187,7 @@ def call_successes(trace: Trace, skills: Sequence[Skill], path: str, over: Array
     for i, skill in enumerate(skills):
         last = over & (trace[path + "skill"] == i)
         if skill.defines("success") and last.any():
-            succeeded[last] = OwnSteps.called(trace, path, skill, last).judged("success")[last]
+            succeeded[last] = OwnSteps.of_skill(trace, path, skill, last).judged("success")[last]
     return succeeded
 
 

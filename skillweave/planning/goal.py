@@ -14,7 +14,7 @@ from skillweave.errors import DeclarationError
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.predicates import Predicate
 from skillweave.policies.selectors import function_name
-from skillweave.skills.outputs import called, checked
+from skillweave.skills.outputs import call_user, checked
 from skillweave.types import Array, Step, read_only
 
 
@@ -100,7 +100,7 @@ class GoalTask:
         convert = partial(checked, n=len(obs), dtype=bool, who=who)
         return cast(
             Array,
-            called(self.reached, read_only(obs), who, more=more, fixed=fixed, convert=convert),
+            call_user(self.reached, read_only(obs), who, more=more, fixed=fixed, convert=convert),
         )
 
     def at(self, goal: Array | None) -> RewardMachine:

@@ -17,7 +17,7 @@ from skillweave.errors import DeclarationError, SkillError
 from skillweave.policies.selectors import function_name
 from skillweave.schema import AtLeastOne, fitted
 from skillweave.skills import Skill
-from skillweave.skills.outputs import answer
+from skillweave.skills.outputs import call_checked
 from skillweave.types import Array, Step
 
 Reads = Literal["obs", "step"]
@@ -81,7 +81,7 @@ class Predicate:
         """
         if self.reads == "obs":
             return self.at(step.next_obs)
-        return answer(self.function, step, bool, f"task: {self.name}()")
+        return call_checked(self.function, step, bool, f"task: {self.name}()")
 
     def at(self, obs: Array) -> Array:
         """Return where a predicate of observations is true, (n,) bool, for ``obs`` (n, …).
@@ -95,7 +95,7 @@ class Predicate:
                 f"the predicate {self.name!r} reads a step, but only an observation is known here"
             )
         try:
-            return answer(self.function, obs, bool, f"task: {self.name}()")
+            return call_checked(self.function, obs, bool, f"task: {self.name}()")
         except SkillError as error:
             if (hint := _hint(error)) is None:
                 raise

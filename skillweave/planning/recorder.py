@@ -331,7 +331,7 @@ class Recorder:
             if isinstance(skill, RecordedSkill):
                 own[acts] = np.nan
             elif skill.defines("reward") and acts.any():
-                steps = OwnSteps.called(trace, self._columns, skill, acts)
+                steps = OwnSteps.of_skill(trace, self._columns, skill, acts)
                 own[acts] = steps.judged("reward")[acts]
         np.add.at(calls["own_return"], at[mine], own[mine])
         calls["last_reward"][at[over]] = own[over]

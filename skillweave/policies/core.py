@@ -343,13 +343,15 @@ def code(what: str, label: str = "", *, needed: bool = True) -> Any:
     return field(metadata=metadata) if needed else field(default=None, metadata=metadata)
 
 
-Asks: TypeAlias = Callable[[Callable[..., Any], Any, Array, str, str], Array]
-"""How functions of users are asked: of a function, a step or observations, the rows (k,) that they
-are of, the skill's path and its name: what it answers, (k,) bool."""
+CallUser: TypeAlias = Callable[[Callable[..., Any], Any, Array, str, str], Array]
+"""A caller of users' functions: takes a function, a step or observations, their rows (k,), the
+skill's path and the function's name, and returns its answer, (k,) bool."""
 
 
-def asked(function: Callable[..., Any], about: Any, rows: Array, path: str, name: str) -> Array:
-    """Ask a function of a user, as ``Asks`` says, without further words.
+def call_plainly(
+    function: Callable[..., Any], about: Any, rows: Array, path: str, name: str
+) -> Array:
+    """Call a function of a user without this library's long messages; a ``CallUser``.
 
     Raises:
         SkillError: it did not return (k,) bool.

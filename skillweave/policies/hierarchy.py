@@ -28,8 +28,8 @@ from .core import (
     OWN,
     RUNNING,
     Array,
-    Asks,
     CallEnd,
+    CallUser,
     Choices,
     LastCall,
     Memory,
@@ -37,7 +37,7 @@ from .core import (
     Step,
     Turn,
     World,
-    asked,
+    call_plainly,
     code,
     end_with_episode,
     observed,
@@ -207,7 +207,7 @@ class CallAndReturn(Choices, RowPolicy):
             the skills do not, and each of its calls begins with a fresh memory.
         greedy: its skills are; else they sample.
         greedy_selector: its selector is, where its caller acts greedily; else it samples.
-        ask: how functions of users are asked.
+        call_user: calls a function of a user, and checks its answer.
 
     Raises:
         PolicyError: lengths do not rise.
@@ -223,7 +223,7 @@ class CallAndReturn(Choices, RowPolicy):
     fresh_calls: bool = False
     greedy: bool = True
     greedy_selector: bool = True
-    ask: Asks = field(default=asked, metadata={"written": False})
+    call_user: CallUser = field(default=call_plainly, metadata={"written": False})
 
     def __post_init__(self) -> None:
         if any(a >= b for a, b in pairwise((0, *self.lengths))):
@@ -478,7 +478,7 @@ class CallAndReturn(Choices, RowPolicy):
         for i, skill in enumerate(self.skills):
             may[:, i] = skill.policy.startable(obs) if skill.policy.restricts else True
             if skill.initiation is not None:
-                may[:, i] &= self.ask(skill.initiation, obs, rows, skill.path, "initiation")
+                may[:, i] &= self.call_user(skill.initiation, obs, rows, skill.path, "initiation")
         return may.repeat(self.each, axis=1)
 
     def startable(self, obs: Array) -> Array:
@@ -545,7 +545,9 @@ class CallAndReturn(Choices, RowPolicy):
                 if skill.policy.restricts:
                     end[mine[skill.policy.stuck(memory[str(i)], at, part.next_obs)]] = LIMIT
             if skill.termination is not None:
-                end[mine[self.ask(skill.termination, part, at, skill.path, "termination")]] = OWN
+                end[
+                    mine[self.call_user(skill.termination, part, at, skill.path, "termination")]
+                ] = OWN
         if self.interruption is not None:
             self._interrupt(self.interruption, memory, rows, step, end)
         end_with_episode(end, step.terminated | step.truncated)
@@ -559,7 +561,9 @@ class CallAndReturn(Choices, RowPolicy):
             over = ended[mine]
             if skill.success is not None:
                 part = seen(i, over)
-                succeeded[over] = self.ask(skill.success, part, rows[over], skill.path, "success")
+                succeeded[over] = self.call_user(
+                    skill.success, part, rows[over], skill.path, "success"
+                )
         for name, who in self._ready.items():
             who.watch(memory[name], rows, step, LastCall(running, end, succeeded))
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .acting_errors import PolicyError, SkillError
-from .core import Around, Array, Memory, RowPolicy, Step, Turn, World, asked, code, observed
+from .core import Around, Array, Memory, RowPolicy, Step, Turn, World, call_plainly, code, observed
 from .mapped import Input, check_places
 from .spaces import Space, allows_each, at
 
@@ -409,7 +409,7 @@ class Override:
 
     def apply(self, obs: Array, action: Array, space: Space) -> tuple[Array, Array]:
         """Return actions (k, …) with it; (k,) bool: where it acted."""
-        holds = asked(self.condition, obs, np.arange(len(obs)), self.name, "condition")
+        holds = call_plainly(self.condition, obs, np.arange(len(obs)), self.name, "condition")
         if holds.any():
             given = self.action(obs[holds]) if callable(self.action) else self.action
             action = action.copy()

@@ -19,7 +19,7 @@ from .core import (
     Step,
     Turn,
     World,
-    asked,
+    call_plainly,
     code,
     observed,
     put,
@@ -175,7 +175,7 @@ def function_name(function: Any) -> str:
 
 
 @dataclass(eq=False)
-class Asked(Rule):
+class FunctionRule(Rule):
     """A function from observations (n, *obs_shape) to skills (n,): names, or places in the list.
 
     Where skills have goals, it returns skills and goals: ``(names, goals)``, the goals
@@ -407,7 +407,7 @@ class StateMachine(Rule):
             if isinstance(event, str):
                 taken &= (last.why != RUNNING) & (last.succeeded == (event == "success"))
             else:
-                taken &= asked(event, step, rows, self.who, function_name(event))
+                taken &= call_plainly(event, step, rows, self.who, function_name(event))
             after[taken] = target
             waits &= ~taken
         memory["state"][rows] = after
@@ -576,7 +576,7 @@ class _Tick:
         if isinstance(node, Branch):
             return self._branch(node, place, rows)
         seen = read_only(self._obs[rows])
-        holds = asked(node.function, seen, rows, self._tree.who, node.name)
+        holds = call_plainly(node.function, seen, rows, self._tree.who, node.name)
         return np.where(holds, Status.SUCCESS, Status.FAILURE)
 
     def _leaf(self, place: int, rows: Array) -> Array:

@@ -6,7 +6,7 @@ Begin with ``base``, the classes; ``skill_set`` makes policies of the skills bel
 from skillweave.policies.core import LastCall
 from skillweave.skills import tree
 from skillweave.skills.automaton import Automaton
-from skillweave.skills.base import Reflex, Skill, asked, is_trained, path_of
+from skillweave.skills.base import Reflex, Skill, call_method, is_trained, path_of
 from skillweave.skills.onnx_file import from_onnx
 from skillweave.skills.ready import ready_policy
 from skillweave.skills.residual import Residual
@@ -22,7 +22,7 @@ __all__ = [
     "Reflex",
     "Residual",
     "Skill",
-    "asked",
+    "call_method",
     "from_function",
     "from_onnx",
     "from_sb3",

@@ -30,7 +30,7 @@ from skillweave.schema import (
 )
 from skillweave.skills.goal_spaces import alone, draw_from
 from skillweave.skills.learnable import Learnable
-from skillweave.skills.outputs import Wrapped, answer, as_array, called
+from skillweave.skills.outputs import Wrapped, as_array, call_checked, call_user
 from skillweave.skills.own_part import declared_acts, declared_sees
 from skillweave.skills.residual import Residual
 from skillweave.skills.spelling import misspelt
@@ -337,7 +337,7 @@ class Reflex:
         self.name = str(name or getattr(condition, "__name__", "reflex"))
 
     def override(self, space: Data) -> Override:
-        """Return the reflex for actions of a space, asked with this library's messages.
+        """Return the reflex for actions of a space, called with this library's messages.
 
         Raises:
             DeclarationError: its action is fixed, and is not in ``space``.
@@ -354,13 +354,13 @@ class Reflex:
         Raises:
             SkillError: the condition returned a wrong result; the message names it.
         """
-        return answer(self.condition, obs, bool, f"{self._label}: condition()")
+        return call_checked(self.condition, obs, bool, f"{self._label}: condition()")
 
     def _act(self, space: Data, obs: Array) -> Array:
         """Return the actions (n, ...) of its function."""
         label = f"{self._label}: action()"
         convert = partial(space.actions, n=len(obs), who=label, kind=SkillError)
-        return cast(Array, called(self.action, obs, label, convert=convert))
+        return cast(Array, call_user(self.action, obs, label, convert=convert))
 
     def _fixed(self, space: Data) -> Array:
         """Return a fixed action, (1, ...)."""
@@ -378,7 +378,7 @@ class Reflex:
         return f"reflex {self.name!r}"
 
 
-def asked(
+def call_method(
     skill: Skill,
     method: str,
     about: Step | Array,
@@ -390,9 +390,9 @@ def asked(
         ids: environments of the rows, (n,), for messages; None: all n.
 
     Raises:
-        SkillError: see ``answer``.
+        SkillError: see ``call_checked``.
     """
     dtype = np.float32 if method == "reward" else bool
     who = f"skill {path_of(skill)!r}: {method}()"
     may_change = method == "reward" and skill.reward_changes
-    return answer(getattr(skill, method), about, dtype, who, ids, may_change=may_change)
+    return call_checked(getattr(skill, method), about, dtype, who, ids, may_change=may_change)

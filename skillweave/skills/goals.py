@@ -21,7 +21,7 @@ from skillweave.policies.spaces import space_of
 from skillweave.skills.base import Skill, path_of
 from skillweave.skills.function_state import untouched
 from skillweave.skills.goal_spaces import alone
-from skillweave.skills.outputs import called
+from skillweave.skills.outputs import call_user
 from skillweave.types import Array, Step, read_only
 
 
@@ -64,7 +64,7 @@ class Goals(CallGoals):
 
     def _clip(self, obs: Array, goals: Array) -> Any:
         who = f"{self._who}: clip_goal()"
-        return called(self.skill.clip_goal, read_only(obs), who, more=(read_only(goals),))
+        return call_user(self.skill.clip_goal, read_only(obs), who, more=(read_only(goals),))
 
     def join(self, obs: Array, goal: Array) -> Array:
         """Return what the skill's networks see: one array (…) of observations and goals.
@@ -85,7 +85,7 @@ class Goals(CallGoals):
         """
         goal, rows = self.start(len(obs)), np.arange(len(obs))
         for _ in range(TRIES):
-            given = called(self.skill.goals, read_only(obs), self._label, fixed=(rng,))
+            given = call_user(self.skill.goals, read_only(obs), self._label, fixed=(rng,))
             goal[rows] = self.fitted(obs, given, self._label)
             again = self.hold(obs, goal[rows], self.skill.termination)
             if not again.any():
@@ -146,7 +146,7 @@ def check_reads_goal(skill: Skill, step: Step) -> None:
         for method in filter(skill.defines, ("reward", "termination", "success")):
             who = f"skill {path_of(skill)!r}: {method}()"
             with untouched(skill):  # it leaves no traces
-                called(getattr(skill, method), watched, who, judges=None)
+                call_user(getattr(skill, method), watched, who, judges=None)
     except SkillweaveError:
         return  # it is raised where the step is judged
     if not watched.reads:

@@ -23,7 +23,7 @@ OF_DICTS = ("no field of name", "dtype([", "VoidDType", "numpy.void")
 """Parts of errors of NumPy about an array of a Dict or Tuple, which is not a plain array."""
 
 
-def called(
+def call_user(
     function: Any,
     argument: Any,
     who: str,
@@ -75,30 +75,30 @@ def called(
 
 @dataclass(frozen=True)
 class Wrapped:
-    """A function of the user, ``bare``, that is asked with this library's messages.
+    """A function of the user, ``bare``, called with this library's messages.
 
     Exports name it.
     """
 
     bare: Callable[..., Any]
-    ask: Callable[..., Any]
+    call: Callable[..., Any]
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Return the answer of the function."""
-        return self.ask(*arguments, **named)
+        return self.call(*arguments, **named)
 
 
 def of_numbers(function: Any, who: str) -> Wrapped:
-    """Return a function of observations that makes numbers, asked by ``called``."""
+    """Return a function of the user, observations to numbers, called by ``call_user``."""
     return Wrapped(function, partial(_numbers, function, who))
 
 
 def _numbers(function: Any, who: str, obs: Array) -> Array:
     convert = partial(as_array, who=who, kind=PolicyError)
-    return cast(Array, called(function, obs, who, kind=PolicyError, convert=convert))
+    return cast(Array, call_user(function, obs, who, kind=PolicyError, convert=convert))
 
 
-def answer(
+def call_checked(
     function: Callable[[Any], Any],
     about: Step | Array,
     dtype: type,
@@ -129,12 +129,14 @@ def answer(
         return checked(value, n, dtype, who, elapsed, ids)
 
     judges = None if may_change else True
-    return cast(Array, called(function, about, who, ids, judges=judges, convert=convert))
+    return cast(Array, call_user(function, about, who, ids, judges=judges, convert=convert))
 
 
-def ask(function: Callable[[Any], Any], about: Any, rows: Array, path: str, name: str) -> Array:
-    """Ask a function of a user; see ``policies.core.Asks`` and ``answer``."""
-    return answer(function, about, bool, f"skill {path!r}: {name}()", rows)
+def call_skill(
+    function: Callable[[Any], Any], about: Any, rows: Array, path: str, name: str
+) -> Array:
+    """Call a method of a skill that acts; a ``policies.core.CallUser``, see ``call_checked``."""
+    return call_checked(function, about, bool, f"skill {path!r}: {name}()", rows)
 
 
 def checked(

@@ -17,7 +17,13 @@ from skillweave.policies.parts import GOAL
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
-from skillweave.skills.outputs import Wrapped, as_array, called, parameters_of, required_arguments
+from skillweave.skills.outputs import (
+    Wrapped,
+    as_array,
+    call_user,
+    parameters_of,
+    required_arguments,
+)
 from skillweave.types import Array, read_only
 
 
@@ -78,7 +84,7 @@ class ScriptedPolicy(MappedPolicy):
         space = self.action_space
         first, more = (given[0], given[1:]) if given else (None, ())
         looks = all(shape[0] is None for shape in mapping.state)
-        value = called(
+        value = call_user(
             self.function, first, who, kind=PolicyError, more=more, named=named, looks=looks
         )
         if not given:

@@ -20,8 +20,8 @@ from skillweave.policies.core import LastCall
 from skillweave.policies.functional import Functional
 from skillweave.policies.parts import GOAL
 from skillweave.policies.selectors import (
-    Asked,
     Branch,
+    FunctionRule,
     Leaf,
     Rule,
     TreeCondition,
@@ -33,7 +33,7 @@ from skillweave.policies.untrusted import checksum
 from skillweave.skills.foreign_policy import Foreign, made_up, qualified
 from skillweave.skills.function_state import examples
 from skillweave.skills.goal_spaces import alone
-from skillweave.skills.outputs import Wrapped, answer, called, required_arguments
+from skillweave.skills.outputs import Wrapped, call_checked, call_user, required_arguments
 from skillweave.skills.tree import Composite, Condition, Node, Sequence
 from skillweave.types import Array
 
@@ -48,7 +48,7 @@ class ReadySelector(Functional, Foreign):
     lengths: tuple[int, ...] = ()
     """The lengths of calls that it chooses with skills; empty: it chooses skills alone."""
     in_place: Any
-    """The ``Rule`` that acts, whose functions are asked with this library's messages.
+    """The ``Rule`` that acts, whose functions are called with this library's messages.
 
     It is made when it is first needed, so that the skills and their goals are known; it raises a
     SkillError where a fixed goal does not fit its skill."""
@@ -58,7 +58,7 @@ class ReadySelector(Functional, Foreign):
         self.skills: tuple[str, ...] = ()
 
     def __init_subclass__(cls) -> None:
-        """Refuse methods that nobody would ask, as the rule acts."""
+        """Refuse methods that nothing would call, as the rule acts."""
         for method in {"start", "act", "observe", "watch", "chances", "allowed"} & vars(cls).keys():
             raise DeclarationError(
                 f"{cls.__name__}.{method}() would not be asked: a ready selector acts by its "
@@ -104,7 +104,7 @@ class ReadySelector(Functional, Foreign):
     def _goal(self, name: str, goal: Any, where: str) -> Any:
         """Return a goal of ``(name, goal)`` for a rule; ``where`` it is declared, for messages."""
         if callable(goal):
-            return Wrapped(goal, partial(called, goal, who=f"{where}: the goal of {name!r}"))
+            return Wrapped(goal, partial(call_user, goal, who=f"{where}: the goal of {name!r}"))
         if (space := self.goal_spaces.get(name)) is None:
             return goal
         data = space_of(space)
@@ -116,7 +116,7 @@ def checked_function(
     function: Callable[[Any], Any], who: str, name: str, dtype: type = bool
 ) -> Wrapped:
     """Return a function of observations or of steps to (n,), whose answers are checked."""
-    return Wrapped(function, partial(answer, function, dtype=dtype, who=f"{who}: {name}()"))
+    return Wrapped(function, partial(call_checked, function, dtype=dtype, who=f"{who}: {name}()"))
 
 
 def goal_as_json(goal: Any) -> Any:
@@ -174,17 +174,17 @@ class FunctionSelector(ReadySelector):
         self.function = function
 
     @cached_property
-    def in_place(self) -> Asked:  # type: ignore[override]
+    def in_place(self) -> FunctionRule:  # type: ignore[override]
         """The rule that acts."""
         asks_last = required_arguments(self.function) > 1
-        return Asked(*self._rule_of, Wrapped(self.function, self._ask), asks_last)
+        return FunctionRule(*self._rule_of, Wrapped(self.function, self._ask), asks_last)
 
     def _ask(self, obs: Array, *last: LastCall) -> Any:
         def convert(value: Any) -> Any:
             self.in_place.parted(value, len(obs))
             return value
 
-        return called(self.function, obs, self._who, more=last, convert=convert)
+        return call_user(self.function, obs, self._who, more=last, convert=convert)
 
     def source(self) -> dict[str, Any]:
         """Return the function's name."""

@@ -18,7 +18,7 @@ from skillweave.skills import Reflex, Skill, path_of
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.lengths import Lengths
-from skillweave.skills.outputs import ask, blame
+from skillweave.skills.outputs import blame, call_skill
 from skillweave.skills.own_part import OwnPart
 from skillweave.types import Memoryless
 
@@ -121,7 +121,7 @@ def acting_policy(
         fresh_calls=goals is not None,
         greedy=skills.greedy,
         greedy_selector=skills.greedy_selector,
-        ask=ask,
+        call_user=call_skill,
     )
     if skills.reflexes:
         policy = _overridden(policy, skills.reflexes, skills.action_space)
@@ -237,7 +237,7 @@ def policy_of(
 
 
 ENDS = ("initiation", "termination", "success")
-"""The methods of a skill that are asked while it acts."""
+"""The methods of a skill that are called while it acts."""
 
 
 def _check_memory(policy: RowPolicy) -> None:

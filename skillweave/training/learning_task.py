@@ -33,8 +33,8 @@ class LearningTask:
     """Keys of ``info`` in the log of calls; None: none is kept."""
 
     @property
-    def called(self) -> SkillSet | None:
-        """What is called in the outermost hierarchy; None: it is another learner's task."""
+    def skills(self) -> SkillSet | None:
+        """The skills of the outermost hierarchy, where its calls are learnt; else None."""
         who = self.who
         return who.skills if isinstance(who, Calling) and who.skill is None else None
 

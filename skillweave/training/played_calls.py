@@ -17,7 +17,7 @@ from skillweave.planning.columns import GOAL, OF_CALL
 from skillweave.planning.recorder import SUMS, Recorder, TraceFeed, calls_in, goals_in, levels_below
 from skillweave.policies.core import EPISODE, LIMIT, OWN, RUNNING, end_with_episode
 from skillweave.policies.parts import OWN_GOAL
-from skillweave.skills import Reflex, Skill, asked
+from skillweave.skills import Reflex, Skill, call_method
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.skill_set import SkillSet, skills_below
@@ -175,7 +175,7 @@ class PlayedCalls:
         tau = self._tau[rows]
         tau[step.elapsed == 1] = WAITS
         if len(waiting := np.flatnonzero(tau == WAITS)):
-            may = asked(skill, "initiation", step.obs[waiting], rows[waiting])
+            may = call_method(skill, "initiation", step.obs[waiting], rows[waiting])
             tau[waiting[may]] = 0
         runs = np.flatnonzero(tau >= 0)
         tau[runs] += 1

@@ -97,7 +97,7 @@ def begin_calls(
 ) -> tuple[LearningTask, Recorder | None]:
     """Return a stage's task, and the recorder of its calls; None: no calls are logged."""
     steps = run.manifest.log_calls
-    skills = learning_task.called
+    skills = learning_task.skills
     if steps is None or skills is None:
         return learning_task, None
     info, spec = run.manifest.log_calls_info, learning_task.role.spec

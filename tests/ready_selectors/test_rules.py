@@ -11,8 +11,8 @@ import pytest
 from skillweave.policies.acting_errors import PolicyError, SkillError
 from skillweave.policies.core import LIMIT, OWN, RUNNING, LastCall, Turn, World
 from skillweave.policies.selectors import (
-    Asked,
     Branch,
+    FunctionRule,
     Leaf,
     Rule,
     StateMachine,
@@ -37,7 +37,7 @@ def flag(obs: Any) -> Any:
 
 
 def asked(skills: Any = ABC, goals: Any = None) -> Rule:
-    return Asked("it", skills, goals or {}, first)
+    return FunctionRule("it", skills, goals or {}, first)
 
 
 def automaton(states: Any, arrows: Any = (), start: str = "x", goals: Any = ()) -> Rule:

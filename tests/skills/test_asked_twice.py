@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skillweave.errors import DeclarationError, SkillError
-from skillweave.skills import Reflex, Skill, asked
+from skillweave.skills import Reflex, Skill, call_method
 from skillweave.types import Step
 
 
@@ -71,7 +71,7 @@ def test_a_skill_that_answers_otherwise_when_asked_twice_is_named(kind, method):
     about = step().obs if method == "initiation" else step()
     message = rf"skill '{kind.name}': {method}\(\) answers .* keeps a state of its own.*info"
     with pytest.raises(SkillError, match=message):
-        asked(kind(), method, about)
+        call_method(kind(), method, about)
 
 
 class Noisy(Skill):
@@ -96,13 +96,13 @@ def test_random_rewards_are_no_state():
     skill, twin = Noisy(), Noisy()
     np.random.seed(1)  # noqa: NPY002
     random.seed(1)
-    first = asked(skill, "reward", step())
+    first = call_method(skill, "reward", step())
     after = np.random.rand(), random.random()  # noqa: NPY002
     np.random.seed(1)  # noqa: NPY002
     random.seed(1)
     assert first.tolist() == twin.reward(step()).astype(np.float32).tolist()
     assert after == (np.random.rand(), random.random()), "the checks draw no numbers of their own"  # noqa: NPY002
-    assert len(asked(skill, "reward", step())) == 4
+    assert len(call_method(skill, "reward", step())) == 4
 
 
 def test_a_reflex_that_keeps_a_state_is_named():
@@ -123,6 +123,6 @@ def test_a_reward_that_is_meant_to_change_says_so():
     class Wrong(Counts):
         reward_changes = "yes"
 
-    assert asked(Bonus(), "reward", step()).tolist() == [1] * 4
+    assert call_method(Bonus(), "reward", step()).tolist() == [1] * 4
     with pytest.raises(DeclarationError, match="reward_changes is 'yes'; it must be True or False"):
         Wrong().validate()

@@ -16,7 +16,7 @@ import skillweave as sw
 from skillweave._internal.notices import collected_notices
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
 from skillweave.planning import GoalTask, Predicate
-from skillweave.skills import Skill, asked
+from skillweave.skills import Skill, call_method
 from skillweave.types import Step
 
 DRAWS = np.random.default_rng(4)
@@ -50,7 +50,7 @@ def said(
         for seed in range(calls):
             step = step_of(n, dtype, low, high, seed)
             try:
-                asked(skill, method, step.obs if method == "initiation" else step)
+                call_method(skill, method, step.obs if method == "initiation" else step)
             except SkillError as error:
                 return f"error: {error}"
         return "".join(notices.take())
@@ -154,7 +154,7 @@ def test_a_look_makes_two_calls_at_calls_that_become_rare():
 
     skill = type("It", (Skill,), {"reward": lambda self, step: reward(step)})()
     for seed in range(20):
-        asked(skill, "reward", step_of(8, np.uint8, 0, 9, seed))
+        call_method(skill, "reward", step_of(8, np.uint8, 0, 9, seed))
         seen.append(len(sizes))
     assert np.diff([0, *seen]).tolist() == [3 if i in (1, 4, 16) else 1 for i in range(1, 21)]
 

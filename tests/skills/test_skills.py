@@ -7,7 +7,7 @@ from gymnasium.spaces import Box, Discrete
 from skillweave._internal.messages import short
 from skillweave.errors import SkillweaveError
 from skillweave.policies.spaces import space_of
-from skillweave.skills import Reflex, Skill, asked, from_function
+from skillweave.skills import Reflex, Skill, call_method, from_function
 from skillweave.skills.outputs import checked
 from skillweave.types import Step
 
@@ -127,7 +127,7 @@ def step_of(last: int = 2) -> Step:
 def test_a_reward_of_another_kind_is_told(bad, says):
     skill = type("Odd", (Skill,), {"reward": lambda self, step: bad})()
     with pytest.raises(SkillweaveError, match=rf"skill 'odd': reward\(\) {says}|{says}"):
-        asked(skill, "reward", step_of(2))
+        call_method(skill, "reward", step_of(2))
 
 
 @pytest.mark.parametrize("method", ["termination", "success", "initiation"])
@@ -144,7 +144,7 @@ def test_a_reward_of_another_kind_is_told(bad, says):
 def test_what_is_neither_yes_nor_no_is_told(method, bad, says):
     skill = type("Odd", (Skill,), {method: lambda self, about: bad})()
     with pytest.raises(SkillweaveError, match=rf"skill 'odd': {method}\(\) {says}"):
-        asked(skill, method, step_of(3))
+        call_method(skill, method, step_of(3))
 
 
 def test_zeros_and_ones_of_any_kind_are_yes_and_no():
@@ -156,7 +156,7 @@ def test_zeros_and_ones_of_any_kind_are_yes_and_no():
 
         skill = type("Fine", (Skill,), {"termination": termination})()
         step = dataclasses.replace(step_of(), obs=np.array([[0.0], [1.0]]))
-        found = asked(skill, "termination", step)
+        found = call_method(skill, "termination", step)
         assert (found.dtype, found.tolist()) == (bool, [True, False])
 
 
@@ -167,7 +167,7 @@ def test_an_error_of_a_skill_is_told_with_its_step_and_line_and_is_its_cause():
 
     says = r"skill 'divides': reward\(\) raised ZeroDivisionError.*\(test_skills.py, line \d+\) at "
     with pytest.raises(SkillweaveError, match=f"{says}step 4") as raised:
-        asked(Divides(), "reward", step_of(4))
+        call_method(Divides(), "reward", step_of(4))
     assert isinstance(raised.value.__cause__, ZeroDivisionError)
 
 
@@ -183,7 +183,7 @@ def test_a_skill_cannot_change_what_others_see(name):
 
     step = step_of()
     with pytest.raises(SkillweaveError, match=r"reward\(\) raised ValueError.*change a copy"):
-        asked(Writes(), "reward", step)
+        call_method(Writes(), "reward", step)
 
 
 def test_what_a_step_is_made_of_can_still_be_changed_by_its_owner():
@@ -201,7 +201,7 @@ def test_observations_cannot_be_changed_either(function):
 
     skill = type("Writes", (Skill,), {"initiation": lambda self, obs: write(obs)})()
     call = {
-        "initiation": lambda obs: asked(skill, "initiation", obs),
+        "initiation": lambda obs: call_method(skill, "initiation", obs),
         "condition": lambda obs: Reflex(write, 0).holds(obs),
         "policy": lambda obs: from_function(write).act({}, obs),
     }[function]

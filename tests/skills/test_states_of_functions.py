@@ -19,11 +19,11 @@ from skillweave.errors import PolicyError
 from skillweave.planning import GoalTask, Predicate, RewardMachine
 from skillweave.policies.core import LastCall, Turn, World
 from skillweave.policies.spaces import space_of
-from skillweave.skills import Automaton, Reflex, Skill, asked, from_function, ready_selector
+from skillweave.skills import Automaton, Reflex, Skill, call_method, from_function, ready_selector
 from skillweave.skills.foreign_policy import check_spaces
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.skills.goals import Goals
-from skillweave.skills.outputs import answer, called
+from skillweave.skills.outputs import call_checked, call_user
 from skillweave.skills.probing import look_at
 from skillweave.types import Memoryless
 
@@ -107,7 +107,7 @@ def method(name: str):
         "goals": lambda: goals.draw(OBS, np.random.default_rng(0)),
         "clip_goal": lambda: goals.fitted(OBS, OBS, "it"),
     }
-    return ways.get(name, lambda: asked(goals.skill, name, about))
+    return ways.get(name, lambda: call_method(goals.skill, name, about))
 
 
 def places() -> dict[str, list[Callable[[], Any]]]:
@@ -158,7 +158,7 @@ def test_every_module_that_calls_functions_of_the_user_is_tested():
         name.removeprefix("skillweave.")
         for name, module in sys.modules.items()
         if name.startswith("skillweave.") and not name.endswith(others)
-        for rule in (called, answer, look_at)
+        for rule in (call_user, call_checked, look_at)
         if vars(module).get(rule.__name__) is rule
     }
     assert calls == set(places())
@@ -190,7 +190,7 @@ class Fine:
 def test_caches_generators_and_unread_attributes_are_no_state():
     fine = Fine()
     for _ in range(4):  # a notice would be an error here
-        called(fine, OBS, "it")
+        call_user(fine, OBS, "it")
     assert fine.calls == 4, "the calls to find a state leave no trace"
 
 
