@@ -19,7 +19,7 @@ EVALUATIONS = "evaluation*.json"
 """Saved evaluations of a run, which are of the policy before it continued."""
 
 
-def to_continue(path: Path) -> RunDirectory | None:
+def continuable_run(path: Path) -> RunDirectory | None:
     """Return the run in a directory, if there is something to continue."""
     if not (path / "run.json").exists():
         return None
@@ -27,7 +27,7 @@ def to_continue(path: Path) -> RunDirectory | None:
     return run if run.finished or run.has_learnt else None
 
 
-def prepared(
+def continue_run(
     declared: D,
     content: Manifest,
     run: RunDirectory,

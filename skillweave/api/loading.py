@@ -10,7 +10,7 @@ from skillweave._internal.shipped import names
 from skillweave.api import Agent, Hierarchy, Run, run_of
 from skillweave.api.applying import load_policy
 from skillweave.api.recipe_file import hierarchy_in
-from skillweave.api.running import begin, begun
+from skillweave.api.running import existing_run, start_run
 from skillweave.api.train_options import TrainOptions
 from skillweave.errors import DeclarationError, RunError
 from skillweave.runs import hub
@@ -100,16 +100,16 @@ def from_hub(
     return load_from(hub.download(name, revision), hierarchy, ask=ASK_FROM_HUB)
 
 
-def finish(declared: Hierarchy, content: Manifest, run_dir: Path) -> Run:
+def finished_run(declared: Hierarchy, content: Manifest, run_dir: Path) -> Run:
     """Return the finished run of this manifest in ``run_dir``; train what is missing.
 
     Raises:
         RunError: the directory holds a run of another manifest.
     """
-    run = begun(declared, content, run_dir)
+    run = existing_run(declared, content, run_dir)
     if run is None:
         options = TrainOptions(run_dir, seed=content.seed, quiet=True)
-        return run_of(begin(declared, content, options))
+        return run_of(start_run(declared, content, options))
     return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)
 
 

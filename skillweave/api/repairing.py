@@ -13,7 +13,7 @@ from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.config import OnPolicy, config_to_json
 from skillweave.api.applying import Trained, apply_manifest
 from skillweave.api.planning import lacking_features
-from skillweave.api.running import begin, go_on
+from skillweave.api.running import start_run, train_stages
 from skillweave.api.train_options import RepairOptions
 from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy import training
@@ -58,7 +58,7 @@ def repair(
     roles = roles_of(declared)
     skill, after = _checked(roles, options.skill, options.after)
     if options.resume:
-        return _go_on(declared, skill, after, options)
+        return _resume_repair(declared, skill, after, options)
     place = None if options.run_dir is None else as_path(options.run_dir, "run_dir")
     if place is not None and (place / "run.json").exists():
         raise RunError(
@@ -115,10 +115,10 @@ def repair(
             save_rehearsal(run, entry.name, rehearsal)
 
     content = replace(content, stages=[*content.stages, entry], code=roles.code)
-    return begin(declared, content, options.training, reason, write, done)
+    return start_run(declared, content, options.training, reason, write, done)
 
 
-def _go_on(declared: D, skill: str, after: str, options: RepairOptions) -> Trained[D]:
+def _resume_repair(declared: D, skill: str, after: str, options: RepairOptions) -> Trained[D]:
     """Finish a repair that was stopped, with the steps that it was started with."""
     if options.run_dir is None:
         raise DeclarationError(
@@ -138,7 +138,7 @@ def _go_on(declared: D, skill: str, after: str, options: RepairOptions) -> Train
             f"steps is {options.steps:,}, but this repair was started with {budget:,}: "
             "leave out steps"
         )
-    return go_on(apply_manifest(declared, run), run, options.training, done=options.done)
+    return train_stages(apply_manifest(declared, run), run, options.training, done=options.done)
 
 
 def _checked(roles: Roles, skill: Any, after: Any) -> tuple[str, str]:

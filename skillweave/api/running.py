@@ -17,7 +17,7 @@ from skillweave._internal.paths import AGENT
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave._internal.terminal import steady_streams
 from skillweave.api.applying import D, Trained, apply_manifest, differences
-from skillweave.api.continuing import prepared, to_continue
+from skillweave.api.continuing import continuable_run, continue_run
 from skillweave.api.starting import starts
 from skillweave.api.train_options import TrainOptions
 from skillweave.envs.make import EnvSpec
@@ -74,10 +74,10 @@ def train(declared: D, options: TrainOptions) -> Trained[D]:
     if isinstance(declared, Declaration) and flat is False and any(by_stage.values()):
         declared, note = apart_to_evolve(declared)
     content = training.manifest(declared, seed=options.seed, flat=flat, how=how)
-    return begin(declared, content, options, note)
+    return start_run(declared, content, options, note)
 
 
-def begin(
+def start_run(
     declared: D,
     content: Manifest,
     options: TrainOptions,
@@ -105,10 +105,10 @@ def begin(
     )
     with _training(declared) as stack:
         roles = _plan(declared, content, options)
-        if options.resume and (run := to_continue(place)) is not None:
+        if options.resume and (run := continuable_run(place)) is not None:
             stack.callback(run.close)
-            declared, note = prepared(declared, content, run, options.evolve)
-            return go_on(declared, run, options, note)
+            declared, note = continue_run(declared, content, run, options.evolve)
+            return train_stages(declared, run, options, note)
         start_from = options.start_from
         if start_from is None and content.hierarchy is not None and declared._starts is not None:
             start_from = declared._starts()
@@ -125,7 +125,7 @@ def begin(
             stack.callback(_remove_if_empty, place)
         run = RunDirectory.create(place, content, first, hold=True, overwrite=options.overwrite)
         stack.callback(run.close)
-        return go_on(declared, run, options, note, done)
+        return train_stages(declared, run, options, note, done)
 
 
 def _kept_by_populations(content: Manifest) -> str:
@@ -151,7 +151,7 @@ def _remove_if_empty(path: Path) -> None:
         path.rmdir()
 
 
-def begun(declared: Declaration, content: Manifest, run_dir: Path) -> RunDirectory | None:
+def existing_run(declared: Declaration, content: Manifest, run_dir: Path) -> RunDirectory | None:
     """Return the run of this manifest in ``run_dir``; None: it is not started.
 
     Raises:
@@ -239,17 +239,17 @@ def resume(declared: D, options: TrainOptions) -> Trained[D]:
     if not declared.recorded and declared.recipe is None:  # the command line may change a recipe
         flat = run.manifest.hierarchy is None
         note = differences(training.manifest(declared, seed=run.manifest.seed, flat=flat), run)
-    return go_on(applied, run, options, note)
+    return train_stages(applied, run, options, note)
 
 
-def go_on(
+def train_stages(
     declared: D,
     run: RunDirectory,
     options: TrainOptions,
     note: str = "",
     done: Mapping[str, Any] | None = None,
 ) -> Trained[D]:
-    """Train what is left of a run; ``note`` is printed first. ``done``: as of ``begin``."""
+    """Train what is left of a run; ``note`` is printed first. ``done``: as of ``start_run``."""
     if not run.finished:
         _may_train()
     must_be_own(run.path)

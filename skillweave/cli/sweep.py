@@ -27,9 +27,9 @@ from skillweave import recipes
 from skillweave._internal.messages import error_text, short
 from skillweave._internal.terminal import say
 from skillweave.api import Hierarchy
-from skillweave.api.loading import finish
+from skillweave.api.loading import finished_run
 from skillweave.api.recipe_file import imported
-from skillweave.api.running import begun
+from skillweave.api.running import existing_run
 from skillweave.cli import commands
 from skillweave.cli.jobs import ProcessEnded, Processes
 from skillweave.cli.output import Result
@@ -74,7 +74,7 @@ class Job:
                     "--ray on several machines, --out must be in a directory that all share"
                 )
             hierarchy = unpacked(code)
-            trained = finish(hierarchy, self._manifest(hierarchy), self.path)
+            trained = finished_run(hierarchy, self._manifest(hierarchy), self.path)
             score = trained.evaluate(
                 self.evaluate, seed=EVALUATION_SEED, deterministic=True, save=True, quiet=True
             )
@@ -87,7 +87,7 @@ class Job:
     def known(self, hierarchy: Hierarchy) -> float | str | None:
         """Return the result of ``run`` where nothing is left to do; else None."""
         try:
-            run = begun(hierarchy, self._manifest(hierarchy), self.path)
+            run = existing_run(hierarchy, self._manifest(hierarchy), self.path)
             if run is None or not run.finished:
                 return None
             saved = load_evaluation(run)

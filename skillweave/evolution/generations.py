@@ -85,7 +85,7 @@ class EvolvingPopulation:
             self.parts = Parts(self._where.workers, *how)
             self._open.callback(self.parts.close)
 
-    def go_on(self, tensors: dict[str, Tensor], log: StageLog) -> None:
+    def restore(self, tensors: dict[str, Tensor], log: StageLog) -> None:
         """Restore a checkpoint, whose members are in ``tensors``."""
         self.log = log
         if tensors:

@@ -146,7 +146,7 @@ class Agents:
                 margins[relative(path, self.level)] = role.margin
         return margins
 
-    def go_on(self, tensors: dict[str, Tensor], log: StageLog) -> None:
+    def restore(self, tensors: dict[str, Tensor], log: StageLog) -> None:
         """Restore a checkpoint, or prepare to start where ``tensors`` is empty."""
         self.log = log
         self.learners = {name: self._learner(name, tensors) for name in self.algorithms}

@@ -82,7 +82,7 @@ def play(
         played.acting = acting
         played.call_start = before == 0
         yield played
-        restarted = episodes.go_on(played)
+        restarted = episodes.advance(played)
         if len(restarted):
             put(memory, restarted, take(acts.start(n), restarted))
             begin(restarted)
@@ -130,7 +130,7 @@ class SeededEpisodes:
         one = np.ones(len(rows), np.int64)
         return PlayedStep(rows, self.episode[rows], step, raw.reward, one, cut)
 
-    def go_on(self, played: PlayedStep) -> Array:
+    def advance(self, played: PlayedStep) -> Array:
         """Start remaining episodes where others are over; return these environments (m,)."""
         ended = played.rows[played.over]
         first = self._upcoming

@@ -52,7 +52,7 @@ class StageLearner(Protocol):
         """Make the environments."""
         ...
 
-    def go_on(self, tensors: dict[str, Tensor], log: StageLog) -> None:
+    def restore(self, tensors: dict[str, Tensor], log: StageLog) -> None:
         """Restore a checkpoint, or prepare to start where ``tensors`` is empty."""
         ...
 

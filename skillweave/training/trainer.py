@@ -82,7 +82,7 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
             learner.open()
             saved, at = run.load_checkpoint(stage.name) or ({}, Checkpoint.start(stage.name))
             log = StageLog(stage.name, run, course.listeners, at)
-            learner.go_on(saved, log)
+            learner.restore(saved, log)
             policies = learner.train()
         finally:
             learner.close()
