@@ -39,9 +39,10 @@ import numpy as np
 
 from benchmarks.collecting import EPOCHS, NETWORK, grid, ours
 from benchmarks.common import report, table
-from skillweave import PPO, EnvSpec, Network, Ray, train_agent
+from skillweave import PPO, EnvSpec, Network, train_agent
 from skillweave.evolution import Evolution
 from skillweave.types import Array
+from skillweave.workers import Ray
 from skillweave.workers.cluster import imported
 
 SLEEP = 2e-3

@@ -28,19 +28,10 @@ import gymnasium as gym
 import numpy as np
 
 from benchmarks.common import machine
-from skillweave import (
-    PPO,
-    Apart,
-    EnvSpec,
-    Hierarchy,
-    Network,
-    Ray,
-    Skill,
-    recipes,
-    train_agent,
-)
+from skillweave import PPO, Apart, EnvSpec, Hierarchy, Network, Skill, recipes, train_agent
 from skillweave.cli.overrides import apply_overrides
 from skillweave.types import Array, Step
+from skillweave.workers import Ray
 
 GRID = "MiniGrid-DoorKey-8x8-v0"
 ENVS, ROWS, EPOCHS, BATCH = 32, 128, 4, 1024

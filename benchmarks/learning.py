@@ -20,7 +20,8 @@ from typing import Any
 import gymnasium as gym
 
 from benchmarks.common import median, report, table, workers
-from skillweave import DQN, PPO, RNN, SAC, TD3, EnvSpec, Network, recipes, train_agent
+from skillweave import DQN, PPO, SAC, TD3, EnvSpec, Network, recipes, train_agent
+from skillweave.algorithms import RNN
 from skillweave.training.evaluation import Evaluation
 
 

@@ -24,7 +24,7 @@ import gymnasium as gym
 
 from benchmarks.collecting import BATCH, ENVS, EPOCHS, NETWORK, ROWS, grid, ours
 from benchmarks.common import report
-from skillweave import Ray
+from skillweave.workers import Ray
 
 COLLECTORS = 2
 

@@ -47,7 +47,7 @@ class Image(PoolWrapper):
 
 def many(num_envs: int, threads: int, seed: int, room: str = ROOM) -> Image:
     """Make the room in EnvPool, ten times as fast."""
-    return Image(sw.envpool(f"MiniGrid-{room}-v0", num_envs, threads, seed))
+    return Image(sw.envs.envpool(f"MiniGrid-{room}-v0", num_envs, threads, seed))
 
 
 def carrying(obs: Array) -> Array:
@@ -128,7 +128,7 @@ def declare(
     # forgets one before the next comes.
     here = room == ROOM
     fast: dict[str, Any] = {"batch_size": 512, "learning_rate": 1.4e-3}
-    learner = algorithm(**fast) if here else algorithm(sw.SelfImitationPPO)
+    learner = algorithm(**fast) if here else algorithm(sw.algorithms.SelfImitationPPO)
     settings: dict[str, Any] = {
         "call_steps": 32,
         "steps": steps,

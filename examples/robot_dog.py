@@ -43,7 +43,9 @@ class Missions(PoolWrapper):
     def __init__(self, num_envs, threads, seed):
         steps = int(POINTS * SECONDS / DT) + 1  # EnvPool's own limit is 1,000
         name = "Go1JoystickFlatTerrain-v1"
-        super().__init__(sw.envpool(name, num_envs, threads, seed, max_episode_steps=steps), SEEN)
+        super().__init__(
+            sw.envs.envpool(name, num_envs, threads, seed, max_episode_steps=steps), SEEN
+        )
         self.rngs = [np.random.default_rng([seed, i]) for i in range(num_envs)]
         self.points = np.zeros((num_envs, POINTS), complex)
         self.place, self.true = np.zeros((2, num_envs), complex)

@@ -18,8 +18,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from skillweave import Hierarchy, Skill, evaluate, from_function, make_options_env
-from skillweave.envs import OptionsEnv
+from skillweave import Hierarchy, Skill, evaluate, from_function
+from skillweave.envs import OptionsEnv, make_options_env
 from skillweave.types import Array, Evaluation, HierarchyPolicy, Policy
 
 GAMMA = 0.999  # of one environment step

@@ -7,14 +7,21 @@ from skillweave._internal.public import lazy
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from skillweave import (
+        algorithms as algorithms,
+        envs as envs,
+        errors as errors,
+        evolution as evolution,
+        reporting as reporting,
+        types as types,
+        workers as workers,
+    )
     from skillweave.algorithms.config import (
         DQN as DQN,
         PPO as PPO,
         SAC as SAC,
         TD3 as TD3,
-        SelfImitationPPO as SelfImitationPPO,
     )
-    from skillweave.algorithms.schedules import Linear as Linear
     from skillweave.api import (
         Agent as Agent,
         Hierarchy as Hierarchy,
@@ -22,15 +29,12 @@ if TYPE_CHECKING:
         train_agent as train_agent,
     )
     from skillweave.api.loading import from_hub as from_hub, load as load
-    from skillweave.api.make_options import make_options_env as make_options_env
     from skillweave.api.player import Player as Player
     from skillweave.api.policies import load_policy as load_policy, save_policy as save_policy
     from skillweave.envs.make import EnvSpec as EnvSpec
-    from skillweave.envs.pool import envpool as envpool
     from skillweave.errors import SkillweaveError as SkillweaveError
     from skillweave.hierarchy.settings import Apart as Apart, Guide as Guide, Selection as Selection
-    from skillweave.networks.config import CNN as CNN, RNN as RNN, Network as Network
-    from skillweave.reporting.curves_figure import plot_curves as plot_curves
+    from skillweave.networks.config import Network as Network
     from skillweave.skills import (
         Reflex as Reflex,
         Residual as Residual,
@@ -53,6 +57,5 @@ if TYPE_CHECKING:
     from skillweave.training.evaluation import evaluate as evaluate
     from skillweave.training.stage import Together as Together
     from skillweave.types import Step as Step
-    from skillweave.workers.cluster import Ray as Ray
 else:
     __all__, __getattr__, __dir__ = lazy(__name__)

@@ -24,7 +24,8 @@ import numpy as np
 from declaring import plainly
 from hypothesis import HealthCheck, Phase, given, seed, settings, strategies as st
 
-from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, EnvSpec, Hierarchy, Network, Reflex, Skill
+from skillweave import DQN, PPO, SAC, TD3, EnvSpec, Hierarchy, Network, Reflex, Skill
+from skillweave.algorithms import CNN, RNN
 from skillweave.errors import SkillweaveError
 
 TINY = Network((4,))

@@ -11,7 +11,8 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from skillweave import DQN, PPO, RNN, Hierarchy, Network, Run, Skill
+from skillweave import DQN, PPO, Hierarchy, Network, Run, Skill
+from skillweave.algorithms import RNN
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import LevelEntry, Manifest, StageEntry

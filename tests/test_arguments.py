@@ -84,7 +84,7 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
     (lambda: sw.Reflex(print), "Reflex() needs action: write Reflex(condition, action)"),
     (lambda: sw.tree.Sequence("a", memry=True), "is 'memory' meant"),
     (lambda: sw.evaluate(), "evaluate() needs policy and env: write evaluate(policy, env)"),
-    (lambda: sw.envpool("CartPole-v1"), "envpool() needs num_envs and threads and seed"),
+    (lambda: sw.envs.envpool("CartPole-v1"), "envpool() needs num_envs and threads and seed"),
     # Groups of settings
     (lambda: plan(rnn=1), "write algorithm=PPO(network=Network(rnn=...))"),
     (lambda: plan(call_step=5), "Plan has no setting 'call_step': is 'call_steps' meant"),

@@ -162,7 +162,7 @@ USES = {
     "evaluate": lambda run, to: run.evaluate(2, quiet=True),
     "evaluate a skill": lambda run, to: run.evaluate(2, skill="left", quiet=True),
     "render": lambda run, to: run.render(to / "film.gif", quiet=True),
-    "make_options_env": lambda run, to: sw.make_options_env(run, 2, 0.99).close(),
+    "make_options_env": lambda run, to: sw.envs.make_options_env(run, 2, 0.99).close(),
     "report": lambda run, to: run.report(to / "report.html", episodes=2, films=0, quiet=True),
 }
 
@@ -181,7 +181,7 @@ def test_environments_of_skills_are_made_from_the_seed(everywhere):
     made = []
     for number, seed in enumerate((1, 1, 2)):
         disturb(number)
-        env = sw.make_options_env(everywhere, 2, 0.99, seed=seed)
+        env = sw.envs.make_options_env(everywhere, 2, 0.99, seed=seed)
         made.append([one.unwrapped.weight for one in env.engine.envs])
         env.close()
     assert made[0] == made[1] != made[2]

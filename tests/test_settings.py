@@ -94,7 +94,7 @@ WIDTHS = listed(whole(1, 65_536), some=(16, 8, 8))
 NETWORK = settings(sw.Network((8,)), {"hidden": [8]})
 RATE = Kind(
     (*NOT_A_NUMBER, 0, -1.0, INF, (1, 2), {"start": 1}, {"start": 1, "end": -1}),
-    (0.5, np.float64(0.5), 1, sw.Linear(1e-3, 0), {"start": 1e-3, "end": 0.0}),
+    (0.5, np.float64(0.5), 1, sw.algorithms.Linear(1e-3, 0), {"start": 1e-3, "end": 0.0}),
 )
 LIMITS = Kind(
     (5, "x", None, (1,), (1, 2, 3), (0, 2), (True, 2), (1, 2.5), (3, 2)),
@@ -166,7 +166,7 @@ ACTOR_CRITIC = OFF_POLICY | {"critic": or_none(NETWORK)}
 TABLE: dict[type[Any], dict[str, Kind]] = {
     OnPolicy: ON_POLICY,
     sw.PPO: PPO,
-    sw.SelfImitationPPO: PPO | {
+    sw.algorithms.SelfImitationPPO: PPO | {
         "imitation_rows": whole(1, 10**9), "imitation_steps": MILLION,
         "imitation_coef": NON_NEGATIVE, "imitation_vf_coef": NON_NEGATIVE,
     },
@@ -194,15 +194,15 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
         "ent_coef": POSITIVE, "learn_ent_coef": FLAG, "target_entropy": or_none(ANY),
         "policy_delay": AT_LEAST_ONE,
     },
-    sw.Linear: {"start": NON_NEGATIVE, "end": NON_NEGATIVE},
-    sw.CNN: {
+    sw.algorithms.Linear: {"start": NON_NEGATIVE, "end": NON_NEGATIVE},
+    sw.algorithms.CNN: {
         "kind": word("plain", "impala"), "channels": WIDTHS, "kernels": WIDTHS, "strides": WIDTHS,
     },
-    sw.RNN: {"kind": word("lstm", "gru"), "size": whole(1, 65_536)},
+    sw.algorithms.RNN: {"kind": word("lstm", "gru"), "size": whole(1, 65_536)},
     sw.Network: {
         "hidden": WIDTHS, "activation": word("tanh", "relu", "elu", "silu", "gelu"),
-        "layer_norm": FLAG, "cnn": or_none(settings(sw.CNN(), {"kind": "impala"})),
-        "rnn": or_none(settings(sw.RNN(), {"size": 4})),
+        "layer_norm": FLAG, "cnn": or_none(settings(sw.algorithms.CNN(), {"kind": "impala"})),
+        "rnn": or_none(settings(sw.algorithms.RNN(), {"size": 4})),
         "encoder": or_none(Kind((5, True, None, [], NAN), ("cells",))),
         "sees": or_none(SEES),
         "planes": or_none(word("first", "last")),
@@ -257,7 +257,7 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
         "selection": Kind((5, "x", None, []), (Truncation(), Tournament(3))),
         "mutations": settings(Mutations()),
     },
-    sw.Ray: {
+    sw.workers.Ray: {
         "collectors": or_none(AT_LEAST_ONE),
         "address": or_none(Kind((5, True, None, []), ("auto",))), "cpus": POSITIVE,
         "patience": NON_NEGATIVE,
@@ -267,7 +267,7 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
         "kwargs": Kind((5, "x", None, [], {5: 1}), ({"x": 1}, {})),
         "wrappers": Kind((5, "x", None, ("x",), (None,)), ((gym.Wrapper,), [gym.Wrapper])),
         "engine": word("auto", "envpool", "sync"), "workers": or_none(AT_LEAST_ONE),
-        "pool": or_none(Kind((5, "x", None, []), (sw.envpool,))),
+        "pool": or_none(Kind((5, "x", None, []), (sw.envs.envpool,))),
         "obs_names": or_none(Kind((5, "x", None, [5], {"x": "y"}, {"x": [5]}),
                                   (["x", "y"], {"x": ["y"]}))),
         "check_seed": FLAG,
@@ -298,7 +298,7 @@ class Stay(sw.Skill):
 
 
 NEEDED: dict[type[Any], dict[str, Any]] = {
-    sw.Linear: {"start": 1.0, "end": 0.0},
+    sw.algorithms.Linear: {"start": 1.0, "end": 0.0},
     Range: {"low": 0.25, "high": 4.0, "scale": "linear"},
     sw.Guide: {"selector": np.sign, "target_kl": 0.1},
     sw.EnvSpec: {"env": "CartPole-v1"},

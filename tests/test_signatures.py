@@ -9,6 +9,7 @@ import pytest
 import skillweave as sw
 from skillweave.api.train_options import RepairOptions, TrainOptions
 from skillweave.cli.commands import ResumeCommand, TrainCommand
+from skillweave.cli.elsewhere import OF_TRAIN
 from skillweave.hierarchy.settings import USUAL_CALL_STEPS, Settings
 from skillweave.planning import Planner
 from skillweave.training.defaults import AGENT_DEFAULTS, HIERARCHY_DEFAULTS, TrainDefaults
@@ -127,6 +128,7 @@ def test_defaults_of_training_are_arguments_of_train():
     names = [f.name for f in fields(TrainDefaults) if f.name != "flat"]
     assert names == list(HIERARCHY_DEFAULTS)
     assert [name for name in arguments(sw.Hierarchy.train) if name in names] == names
+    assert OF_TRAIN == AGENT_DEFAULTS
     assert set(AGENT_DEFAULTS) == set(arguments(sw.Agent.train)) & set(names)
 
 

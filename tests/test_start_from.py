@@ -11,17 +11,8 @@ import torch
 from declaring import plainly
 from small_runs import MEMORY, OFF, ON, SMALL, Left, Push, Stopped, assert_same, stop_at
 
-from skillweave import (
-    PPO,
-    SAC,
-    Agent,
-    Hierarchy,
-    Network,
-    SelfImitationPPO,
-    Skill,
-    SkillweaveError,
-    Together,
-)
+from skillweave import PPO, SAC, Agent, Hierarchy, Network, Skill, SkillweaveError, Together
+from skillweave.algorithms import SelfImitationPPO
 from skillweave.cli import main
 from skillweave.errors import RunError
 from skillweave.experience.acting import Acting

@@ -16,7 +16,6 @@ import torch
 from skillweave import (
     DQN,
     PPO,
-    RNN,
     SAC,
     TD3,
     Agent,
@@ -24,10 +23,10 @@ from skillweave import (
     EnvSpec,
     Hierarchy,
     Network,
-    SelfImitationPPO,
     Together,
     load,
 )
+from skillweave.algorithms import RNN, SelfImitationPPO
 from skillweave.evolution import Evolution
 from tests.small_runs import Balance, Left, policies
 

@@ -15,7 +15,6 @@ from gymnasium.spaces import Box, Dict, Discrete
 from skillweave import (
     DQN,
     PPO,
-    RNN,
     SAC,
     Apart,
     EnvSpec,
@@ -28,6 +27,7 @@ from skillweave import (
     Together,
     TrainDefaults,
 )
+from skillweave.algorithms import RNN
 from skillweave.api import Agent, Run
 from skillweave.evolution import Evolution, Mutations
 

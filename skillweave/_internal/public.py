@@ -8,21 +8,16 @@ from typing import Any
 
 PUBLIC = {
     "skillweave": {
-        "algorithms.config": "DQN PPO SAC SelfImitationPPO TD3",
-        "algorithms.schedules": "Linear",
+        "algorithms.config": "DQN PPO SAC TD3",
         "api": "Agent Hierarchy Run train_agent",
         "api.loading": "from_hub load",
-        "api.make_options": "make_options_env",
         "api.player": "Player",
         "api.policies": "load_policy save_policy",
-        "workers.cluster": "Ray",
         "skills.lengths": "Lengths",
         "envs.make": "EnvSpec",
-        "envs.pool": "envpool",
         "errors": "SkillweaveError",
         "hierarchy.settings": "Apart Guide Selection",
-        "networks.config": "CNN Network RNN",
-        "reporting.curves_figure": "plot_curves",
+        "networks.config": "Network",
         "skills": "Reflex Residual Skill from_function from_onnx from_sb3 from_torch tree",
         "skills.automaton": "Automaton",
         "skills.mapping": "Acts Goal LastAction Part",
@@ -33,10 +28,12 @@ PUBLIC = {
     },
     "skillweave.algorithms": {
         "algorithms.base": "ActingParams AgentState Algorithm",
-        "algorithms.config": "OnPolicy",
+        "algorithms.config": "OnPolicy SelfImitationPPO",
         "algorithms.parameters": "ParameterGroup",
+        "algorithms.schedules": "Linear",
         "algorithms.registry": "register_algorithm",
         "algorithms.batches": "Report Rollout Sample",
+        "networks.config": "CNN RNN",
         "networks.encoders": "Encoder register_encoder",
         "networks.heads": "ActionHead",
         "networks.net": "Net",
@@ -47,7 +44,8 @@ PUBLIC = {
         "ops.returns": "gae",
     },
     "skillweave.envs": {
-        "envs.pool": "PoolWrapper one_of",
+        "api.make_options": "make_options_env",
+        "envs.pool": "PoolWrapper envpool one_of",
         "hierarchy.options_env": "OptionsEnv",
     },
     "skillweave.errors": {
@@ -58,6 +56,7 @@ PUBLIC = {
         "evolution.config": "Evolution Mutations Range Tournament Truncation",
         "evolution.selection": "Heir ParentSelection",
     },
+    "skillweave.reporting": {"reporting.curves_figure": "plot_curves"},
     "skillweave.types": {
         "export.write": "Export",
         "hierarchy.policy": "HierarchyPolicy",
@@ -67,6 +66,7 @@ PUBLIC = {
         "training.evaluation": "Evaluation",
         "types": "Policy",
     },
+    "skillweave.workers": {"workers.cluster": "Ray"},
 }
 """By module that users import from: the names of each module of the library."""
 
@@ -87,6 +87,8 @@ def lazy(module: str) -> tuple[list[str], Callable[[str], Any], Callable[[], Ite
     def get(name: str) -> Any:
         if name in homes:
             return getattr(import_module(f"skillweave.{homes[name]}"), name)
+        if f"{module}.{name}" in HOMES:  # sw.algorithms needs no import of its own
+            return import_module(f"{module}.{name}")
         from difflib import get_close_matches
 
         hints = [f": it is in {other}" for other, names in HOMES.items() if name in names]

@@ -15,9 +15,14 @@ if TYPE_CHECKING:
         Algorithm as Algorithm,
     )
     from skillweave.algorithms.batches import Report as Report, Rollout as Rollout, Sample as Sample
-    from skillweave.algorithms.config import OnPolicy as OnPolicy
+    from skillweave.algorithms.config import (
+        OnPolicy as OnPolicy,
+        SelfImitationPPO as SelfImitationPPO,
+    )
     from skillweave.algorithms.parameters import ParameterGroup as ParameterGroup
     from skillweave.algorithms.registry import register_algorithm as register_algorithm
+    from skillweave.algorithms.schedules import Linear as Linear
+    from skillweave.networks.config import CNN as CNN, RNN as RNN
     from skillweave.networks.encoders import (
         Encoder as Encoder,
         register_encoder as register_encoder,

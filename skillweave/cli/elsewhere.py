@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 
 from skillweave._internal.messages import ELSEWHERE, suggest
-from skillweave.training.defaults import AGENT_DEFAULTS
 
 COMMANDS = {
     "enjoy": "evaluate, or render for a film",
@@ -52,6 +51,8 @@ SAME = {
     "workers": "num-workers",
 }
 """Other names of these options."""
+OF_TRAIN = ("eval_every", "eval_episodes", "checkpoint_every", "keep", "log_info")
+"""Arguments of ``train`` that ``--set train.NAME`` sets: ``training.defaults.AGENT_DEFAULTS``."""
 SETTINGS = (
     "batch_size",
     "buffer_size",
@@ -106,7 +107,7 @@ def _way(option: str, trains: bool) -> str | None:
         return way
     setting = option.replace("-", "_")
     setting = ELSEWHERE.get(setting, setting)
-    if setting in AGENT_DEFAULTS:
+    if setting in OF_TRAIN:
         return f"--set train.{setting}=VALUE"
     if setting in SETTINGS:
         return f"--set selector.{setting}=VALUE, and --set skills.NAME.{setting}=VALUE for a skill"

@@ -190,7 +190,7 @@ def one_of(pool: MakePool) -> Callable[..., gym.Env[Any, Any]]:
     from skillweave.envs import one_of
 
     def pendulums(num_envs, threads, seed):
-        return sw.envpool("Pendulum-v1", num_envs, threads, seed)
+        return sw.envs.envpool("Pendulum-v1", num_envs, threads, seed)
 
     spec = sw.EnvSpec(one_of(pendulums), pool=pendulums)
     ```
@@ -209,8 +209,8 @@ def one_of(pool: MakePool) -> Callable[..., gym.Env[Any, Any]]:
     if not callable(pool):
         raise DeclarationError(
             f"one_of() got {short(pool)}; it takes the function that makes the pool: "
-            "def many(num_envs, threads, seed): return skillweave.envpool('CartPole-v1', num_envs, "
-            "threads, seed)"
+            "def many(num_envs, threads, seed): return "
+            "skillweave.envs.envpool('CartPole-v1', num_envs, threads, seed)"
         )
 
     @functools.cache  # a simulator may take half a second to load

@@ -128,8 +128,8 @@ class Network:
     import skillweave as sw
 
     wide = sw.Network((256, 256), "relu", layer_norm=True)
-    with_memory = sw.Network((64,), rnn=sw.RNN("lstm", 32))
-    pixels = sw.Network((512,), "relu", cnn=sw.CNN())
+    with_memory = sw.Network((64,), rnn=sw.algorithms.RNN("lstm", 32))
+    pixels = sw.Network((512,), "relu", cnn=sw.algorithms.CNN())
     from_yaml = sw.PPO(network={"hidden": [64, 64], "rnn": {"kind": "gru"}})
     ```
 

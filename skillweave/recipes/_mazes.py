@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import EnvSpec, envpool
-from skillweave.envs import PoolWrapper
+from skillweave import EnvSpec
+from skillweave.envs import PoolWrapper, envpool
 from skillweave.errors import DeclarationError, needs_extra
 from skillweave.recipes._specs import named
 from skillweave.types import Array

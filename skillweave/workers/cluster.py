@@ -32,7 +32,7 @@ class Ray:
     ```python
     import skillweave as sw
 
-    cluster = sw.Ray(collectors=8, address="10.0.0.1:6379")
+    cluster = sw.workers.Ray(collectors=8, address="10.0.0.1:6379")
     ```
 
     Raises:

@@ -16,9 +16,9 @@ import pytest
 import torch
 from toys import transitions
 
-from skillweave import DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO, SkillweaveError
+from skillweave import DQN, PPO, SAC, TD3, Network, SkillweaveError
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms import register_encoder
+from skillweave.algorithms import RNN, SelfImitationPPO, register_encoder
 from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.batches import Reference, Rehearsal, Rollout
 from skillweave.algorithms.compiled import Compiled

@@ -14,9 +14,9 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
 from torch.utils._pytree import tree_map
 
-from skillweave import DQN, PPO, SAC, TD3, Network, SelfImitationPPO
+from skillweave import DQN, PPO, SAC, TD3, Network
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms import rollouts
+from skillweave.algorithms import SelfImitationPPO, rollouts
 from skillweave.algorithms.base import state_to
 from skillweave.algorithms.batches import Reference, Rollout, Sample
 from skillweave.algorithms.registry import make_algorithm

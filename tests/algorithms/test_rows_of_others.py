@@ -8,8 +8,9 @@ import pytest
 import torch
 from toys import rollout_of
 
-from skillweave import PPO, RNN, Network
+from skillweave import PPO, Network
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms import RNN
 from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.batches import Reference, Rollout
 from skillweave.algorithms.ppo import Terms

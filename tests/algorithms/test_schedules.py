@@ -20,8 +20,9 @@ from small_runs import (
 )
 
 import skillweave as sw
-from skillweave import DQN, PPO, SAC, TD3, Hierarchy, Linear, SelfImitationPPO
+from skillweave import DQN, PPO, SAC, TD3, Hierarchy
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms import Linear, SelfImitationPPO
 from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import SkillCritic, config_from_json, config_to_json
 from skillweave.algorithms.parameters import rate_now

@@ -7,8 +7,9 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
-from skillweave import PPO, Network, SelfImitationPPO
+from skillweave import PPO, Network
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms import SelfImitationPPO
 from skillweave.algorithms.batches import Rollout
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError, RunError
@@ -186,7 +187,7 @@ def test_what_was_kept_is_looked_at_before_it_is_learnt_from():
 
 
 def test_memory_is_refused():
-    from skillweave import RNN
+    from skillweave.algorithms import RNN
 
     with pytest.raises(DeclarationError, match=r"SelfImitationPPO\.network .* without rnn"):
         SelfImitationPPO(network=Network(rnn=RNN("gru", 4)))

@@ -14,7 +14,8 @@ from benchmarks.pay.flat import Flat
 from benchmarks.together import CASES, check_case, one, without_selector
 from examples.bridge import AXE, BRIDGE, RIVER, WIDTH, WOOD, WORK, GetAxe, River, declare
 from examples.doorkey import ROOM
-from skillweave import PPO, Hierarchy, SelfImitationPPO, SkillweaveError, Step, recipes
+from skillweave import PPO, Hierarchy, SkillweaveError, Step, recipes
+from skillweave.algorithms import SelfImitationPPO
 from skillweave.hierarchy.training import manifest
 
 OF_ALL_ALIKE = ("no imitation", "limit ends", "one advantage scale")

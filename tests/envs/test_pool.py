@@ -134,7 +134,7 @@ def test_what_envpool_shows_may_be_changed():
             return obs[:, :1]
 
     def pool(num_envs, threads, seed):
-        return First(sw.envpool("CartPole-v1", num_envs, threads, seed))
+        return First(sw.envs.envpool("CartPole-v1", num_envs, threads, seed))
 
     def one(render_mode=None):
         env = gym.make("CartPole-v1")
@@ -150,7 +150,7 @@ def test_an_environment_that_envpool_does_not_have_is_told():
     pytest.importorskip("envpool")
     says = r"EnvPool has no environment 'CartPool-v1': is 'CartPole-v[01]' meant"
     with pytest.raises(EnvError, match=says):
-        sw.envpool("CartPool-v1", 2, 1, 0)
+        sw.envs.envpool("CartPool-v1", 2, 1, 0)
 
 
 class Parts(Clock):
@@ -265,7 +265,7 @@ def test_one_environment_of_envpool_plays_the_episodes_of_its_seed():
     pytest.importorskip("envpool")
 
     def poles(num_envs, threads, seed):
-        return sw.envpool("CartPole-v1", num_envs, threads, seed, max_episode_steps=12)
+        return sw.envs.envpool("CartPole-v1", num_envs, threads, seed, max_episode_steps=12)
 
     env = one_of(poles)()
     spec = sw.EnvSpec(one_of(poles), pool=poles)

@@ -11,8 +11,9 @@ import pytest
 import torch
 from toys import random_critic
 
-from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO
+from skillweave import DQN, PPO, SAC, TD3, Network
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms import CNN, RNN, SelfImitationPPO
 from skillweave.errors import DeclarationError
 from skillweave.evolution import Mutations
 from skillweave.evolution.architecture import Change, check_architecture, draw_change, rebuilt

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import CNN, DQN, PPO, SAC, TD3, Network
+from skillweave import DQN, PPO, SAC, TD3, Network
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms import CNN
 from skillweave.algorithms.batches import Sample
 from skillweave.algorithms.parameters import LARGEST
 from skillweave.errors import DeclarationError

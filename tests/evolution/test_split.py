@@ -17,8 +17,9 @@ import torch
 from small_runs import interrupt_at_checkpoint
 from test_stage import assert_same_population
 
-from skillweave import DQN, PPO, RNN, Agent, EnvSpec, Network, Ray, SkillweaveError
+from skillweave import DQN, PPO, Agent, EnvSpec, Network, SkillweaveError
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms import RNN
 from skillweave.errors import DeclarationError
 from skillweave.evolution import Evolution, Mutations
 from skillweave.evolution.population import Population
@@ -26,6 +27,7 @@ from skillweave.evolution.shard import FitnessEnvs
 from skillweave.evolution.split import Parts
 from skillweave.training.learning_task import skill_task
 from skillweave.training.role import agent_role
+from skillweave.workers import Ray
 from skillweave.workers.host import LocalWorker, Workers
 from skillweave.workers.placement import Placement, make_collectors
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO
+from skillweave import DQN, PPO, SAC, TD3, Network
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms import RNN, SelfImitationPPO
 from skillweave.algorithms.batches import Rollout, Sample
 from skillweave.evolution.stacks import Member, crop, join, pad, split, stack_key
 from skillweave.networks.stacked import Layout

@@ -15,7 +15,6 @@ from small_runs import assert_same
 from skillweave import (
     DQN,
     PPO,
-    RNN,
     SAC,
     TD3,
     Agent,
@@ -28,6 +27,7 @@ from skillweave import (
     train_agent,
 )
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms import RNN
 from skillweave.errors import DeclarationError
 from skillweave.evolution import (
     Evolution,

@@ -32,7 +32,7 @@ pytest.importorskip("onnxscript")
 torch.set_num_threads(1)
 SMALL = sw.Network(hidden=(8,))
 PPO = sw.PPO(network=SMALL, normalize_obs=False)
-RECURRENT = sw.PPO(network=sw.Network(hidden=(8,), rnn=sw.RNN("gru", 4)))
+RECURRENT = sw.PPO(network=sw.Network(hidden=(8,), rnn=sw.algorithms.RNN("gru", 4)))
 
 
 def mild(config: Any, *spaces: Any, seed: int) -> AgentPolicy:

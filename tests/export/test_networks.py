@@ -15,8 +15,9 @@ import torch
 from torch import nn
 from toys import ASKS, SHOWS
 
-from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network, SkillweaveError
+from skillweave import DQN, PPO, SAC, TD3, Network, SkillweaveError
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms import CNN, RNN
 from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.api.player import Player

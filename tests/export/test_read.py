@@ -31,7 +31,8 @@ from test_state_machine import (
 )
 
 import skillweave as sw
-from skillweave import DQN, PPO, RNN, Network
+from skillweave import DQN, PPO, Network
+from skillweave.algorithms import RNN
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillweaveError
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export

@@ -18,7 +18,8 @@ from reference_calls import POSITION, TAG, Counter, Left, Right, T, Walk, Zigzag
 from test_networks import agent
 from toys import skills_of
 
-from skillweave import PPO, RNN, Automaton, Network, Reflex
+from skillweave import PPO, Automaton, Network, Reflex
+from skillweave.algorithms import RNN
 from skillweave.algorithms.config import SkillCritic
 from skillweave.api.player import Player
 from skillweave.errors import PolicyError

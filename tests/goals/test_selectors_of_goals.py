@@ -197,7 +197,7 @@ def test_a_goal_out_of_reach_is_clipped():
 
 
 def test_an_environment_of_options_takes_goals():
-    env = sw.make_options_env(declared([Rest(), go_to()]).train(quiet=True), 3, 0.9)
+    env = sw.envs.make_options_env(declared([Rest(), go_to()]).train(quiet=True), 3, 0.9)
     env.reset(seed=0)
     env.action_space.seed(0)
     for _ in range(5):
@@ -218,7 +218,7 @@ def test_an_environment_of_options_takes_goals():
     ],
 )
 def test_an_environment_of_options_says_what_is_wrong(actions, says):
-    env = sw.make_options_env(declared([go_to(), Rest()]).train(quiet=True), 2, 0.9)
+    env = sw.envs.make_options_env(declared([go_to(), Rest()]).train(quiet=True), 2, 0.9)
     env.reset(seed=0)
     with pytest.raises(sw.SkillweaveError, match=says):
         env.step(actions)
@@ -228,7 +228,7 @@ def test_an_environment_of_options_does_not_change_goals():
     skill = go_to()
     type(skill).goal_space = BYTES
     run = declared([skill, Rest()], selector=sw.tree.Sequence(("go_to", (1, 2)))).train(quiet=True)
-    env = sw.make_options_env(run, 2, 0.9)
+    env = sw.envs.make_options_env(run, 2, 0.9)
     env.reset(seed=0)
     with pytest.raises(SkillError, match=r"gave the goal \[300, 1\], which is out of goal_space"):
         env.step({"skill": np.zeros(2, int), "goal": {"go_to": np.array([[1, 1], [300, 1]])}})

@@ -13,12 +13,16 @@ from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 
 often = reports_every(40)
+RECURRENT = sw.Network((8,), rnn=sw.algorithms.RNN("gru", 6))
 ALGORITHMS = {
     "PPO": (ON, False),
     "PPO, discrete": (ON, True),
     "PPO, recurrent": (
         sw.PPO(
-            num_envs=4, n_steps=16, batch_size=32, network=sw.Network((8,), rnn=sw.RNN("gru", 6))
+            num_envs=4,
+            n_steps=16,
+            batch_size=32,
+            network=RECURRENT,
         ),
         False,
     ),

@@ -21,6 +21,8 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.training.plain_agent import load_agent_of
 
 often = reports_every(40)
+RECURRENT = sw.Network((8,), rnn=sw.algorithms.RNN("gru", 6))
+IMITATES = sw.algorithms.SelfImitationPPO(num_envs=4, n_steps=16, network=SMALL)
 OFTEN = sw.TrainDefaults(checkpoint_every=60)
 LEARNS = sw.PPO(num_envs=8, n_steps=64, learning_rate=3e-3, ent_coef=0.0, network=sw.Network((32,)))
 
@@ -78,8 +80,8 @@ def declared(name: str) -> sw.Hierarchy:
         "together": {"learn": "together"},
         "apart": {"learn": "apart"},
         "held": {"rest": {"arm": ("hold", 0.5), "grip": "hold"}},
-        "recurrent": {"algorithm": replace(ON, network=sw.Network((8,), rnn=sw.RNN("gru", 6)))},
-        "self-imitation": {"algorithm": sw.SelfImitationPPO(num_envs=4, n_steps=16, network=SMALL)},
+        "recurrent": {"algorithm": replace(ON, network=RECURRENT)},
+        "self-imitation": {"algorithm": IMITATES},
         "nested": {},
     }[name]
     skills = None
@@ -211,7 +213,7 @@ def test_calls_are_logged_and_planned_with_their_actions(tmp_path):
 
 def test_foreign_libraries_choose_skills():
     run = reach().train(quiet=True)
-    env = sw.make_options_env(run, 2, 0.99)
+    env = sw.envs.make_options_env(run, 2, 0.99)
     env.reset(seed=0)
     for skill in range(4):
         _, reward, *_ = env.step(np.full(2, skill))

@@ -100,8 +100,8 @@ def test_random_actions_are_allowed(kind):
 def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
     algorithm = {
         "PPO": ON,
-        "SelfImitationPPO": sw.SelfImitationPPO(num_envs=4, n_steps=16, network=SMALL),
-        "recurrent": replace(ON, network=sw.Network((8,), rnn=sw.RNN("gru", 6))),
+        "SelfImitationPPO": sw.algorithms.SelfImitationPPO(num_envs=4, n_steps=16, network=SMALL),
+        "recurrent": replace(ON, network=sw.Network((8,), rnn=sw.algorithms.RNN("gru", 6))),
     }[name]
 
     class Both(sw.Skill):

@@ -22,10 +22,11 @@ from torch import nn
 from toys import Echo, drawn, learn
 
 import skillweave as sw
-from skillweave import DQN, PPO, RNN, SAC, TD3, Hierarchy, Network, SkillweaveError
+from skillweave import DQN, PPO, SAC, TD3, Hierarchy, Network, SkillweaveError
 from skillweave._internal import named as naming
 from skillweave._internal.named import Named, named
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms import RNN
 from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.errors import DeclarationError, RunError
@@ -444,7 +445,7 @@ def test_lists_and_dicts_are_taken_for_what_they_say():
     made = PPO(network={"hidden": [8], "rnn": {"kind": "gru", "size": 4}})
     assert made.network == Network((8,), rnn=RNN("gru", 4))
     assert SAC(critic={"hidden": [9]}).critic == Network((9,))
-    assert Network(cnn={"channels": [4], "kernels": [3], "strides": [1]}).cnn == sw.CNN(
+    assert Network(cnn={"channels": [4], "kernels": [3], "strides": [1]}).cnn == sw.algorithms.CNN(
         "plain", (4,), (3,), (1,)
     )
     with pytest.raises(DeclarationError, match=r"PPO\.network: .*'hiden'.*'hidden' meant"):

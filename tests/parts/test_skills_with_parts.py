@@ -23,7 +23,7 @@ often = reports_every(40)
 OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}
 OFTEN = sw.TrainDefaults(checkpoint_every=60)
 RECURRENT = sw.PPO(
-    num_envs=4, n_steps=16, batch_size=32, network=sw.Network((8,), rnn=sw.RNN("gru", 6))
+    num_envs=4, n_steps=16, batch_size=32, network=sw.Network((8,), rnn=sw.algorithms.RNN("gru", 6))
 )
 SAC = sw.SAC(**OFF, network=SMALL)
 DQN = sw.DQN(**OFF, train_freq=2, network=SMALL)
@@ -386,7 +386,7 @@ def test_a_population_learns_parts(tmp_path):
 
 
 def test_options_env_calls_skills_with_parts(held):
-    env = sw.make_options_env(held, 2, 0.99)
+    env = sw.envs.make_options_env(held, 2, 0.99)
     env.reset(seed=0)
     before = env.engine.steps_made
     *_, info = env.step(np.array([0, 1]))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from single_step import step_of
 
-from skillweave import Apart, Together, envpool
+from skillweave import Apart, Together
+from skillweave.envs import envpool
 from skillweave.recipes import _rooms as world, keys_and_doors as rooms
 
 SKILLS = {s.name: s for s in (make() for make in rooms.SKILLS)}

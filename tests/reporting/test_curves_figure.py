@@ -72,7 +72,7 @@ def test_a_directory_of_runs_stands_for_its_runs_in_their_order(folder, tmp_path
 
 
 def test_the_median_and_the_quartiles_of_the_seeds_are_drawn(folder, tmp_path):
-    found = sw.plot_curves(folder / "sweep", tmp_path / "figure")
+    found = sw.reporting.plot_curves(folder / "sweep", tmp_path / "figure")
     (line,) = found.lines
     assert (found.metric, line.seeds, line.label) == ("return", 4, "cart")
     # The selector's steps come after those of the two skills, 256 each.
@@ -85,7 +85,7 @@ def test_the_median_and_the_quartiles_of_the_seeds_are_drawn(folder, tmp_path):
     assert found.paths[0].read_bytes()[:4] == b"\x89PNG"
     assert "<svg" in found.paths[1].read_text()
     # Seen again, it is the same file.
-    again = sw.plot_curves(folder / "sweep", tmp_path / "again.svg")
+    again = sw.reporting.plot_curves(folder / "sweep", tmp_path / "again.svg")
     assert again.paths[1].read_bytes() == found.paths[1].read_bytes()
 
 

@@ -11,9 +11,9 @@ import torch
 from gymnasium.spaces import Box, Discrete
 from toys import network_of
 
-from skillweave import EnvSpec, Skill, SkillweaveError, envpool, evaluate
+from skillweave import EnvSpec, Skill, SkillweaveError, evaluate
 from skillweave.algorithms.agent_policy import AgentPolicy
-from skillweave.envs import checked
+from skillweave.envs import checked, envpool
 from skillweave.errors import PolicyError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.skills.scripted import ScriptedPolicy

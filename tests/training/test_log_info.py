@@ -27,7 +27,6 @@ from skillweave import (
     Apart,
     EnvSpec,
     Hierarchy,
-    Ray,
     Skill,
     SkillweaveError,
     Together,
@@ -44,6 +43,7 @@ from skillweave.reporting.report.curves import read_curves
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import identity, read_manifest
 from skillweave.skills.outputs import info_keys
+from skillweave.workers import Ray
 
 
 class Told(Ledger):

@@ -13,7 +13,7 @@ from small_runs import (
     interrupted,
 )
 
-from skillweave import EnvSpec, Hierarchy, Lengths, Ray, Run, Skill, TrainDefaults
+from skillweave import EnvSpec, Hierarchy, Lengths, Run, Skill, TrainDefaults
 from skillweave.errors import DeclarationError, EnvError, RunError
 from skillweave.evolution import Evolution
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -22,7 +22,7 @@ from skillweave.planning.calls import LEARNING
 from skillweave.planning.columns import columns_of
 from skillweave.policies.core import CallEnd
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.workers import placement
+from skillweave.workers import Ray, placement
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 

@@ -182,7 +182,7 @@ def test_call_steps_of_none_in_a_skill_is_said_to_be_the_hierarchys(make, how, t
 
 
 def test_the_options_env_names_what_is_to_be_called_first():
-    env = sw.make_options_env(declared(), num_envs=2, gamma=0.9)
+    env = sw.envs.make_options_env(declared(), num_envs=2, gamma=0.9)
     with pytest.raises(DeclarationError, match="call reset"):
         env.step(np.zeros(2, int))
     env.reset(seed=0)
