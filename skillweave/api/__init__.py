@@ -108,7 +108,7 @@ from skillweave.workers.cluster import Ray
 
 
 class Trainable:
-    """What hierarchies and plain agents have in common."""
+    """The methods that hierarchies and plain agents have in common."""
 
     def __repr__(self: Any) -> str:
         return declared_line(self)
@@ -356,8 +356,9 @@ class Hierarchy(Trainable, Declaration):
     """Words for missions as texts (``Run.plan``): functions of observations or of a ``Step``, by
     name. The name of each skill is such a word already: its ``success``."""
     features: Any = None
-    """By what plans compare observations, as for ``planning.Planner``: a function of observations
-    (n, …) to numbers (n, F), or a dict of these by skill. Skills that see images need it."""
+    """Numbers by which plans compare observations, as for ``planning.Planner``: a function of
+    observations (n, …) to numbers (n, F), or a dict of these by skill. Skills that see images
+    need it."""
     name: str = "hierarchy"
     """Its name where it is a skill of another hierarchy."""
 
@@ -1228,7 +1229,7 @@ def info_json(
 
 
 def run_of(trained: Trained[Hierarchy | Agent]) -> Run:
-    """Return what training or loading made as a ``Run``."""
+    """Return a trained or loaded declaration and its policy as a ``Run``."""
     declared, run, policy = trained
     if run.manifest.hierarchy is None and isinstance(declared, Hierarchy):
         declared = declared.plain_agent()  # the flat baseline

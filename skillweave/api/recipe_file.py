@@ -121,7 +121,7 @@ def read_recipe_file(path: Path, recipe: str, *, shipped: bool = False) -> Modul
 
 
 def _sentence(error: BaseException, recipe: str) -> str:
-    """Return what went wrong while a recipe's file ran."""
+    """Return the sentence that reports an error in a recipe's file."""
     if isinstance(error, SystemExit):
         return (
             f"{recipe} ends Python while it is read ({place(error)}). Put what is to run only as a "

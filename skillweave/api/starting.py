@@ -41,10 +41,10 @@ class InDirectory(Protocol):
 
 
 Origin = str | Path | InDirectory | Learnable | Learnt
-"""What a learner starts from: a run, its directory, or a policy made elsewhere
+"""The source of a learner's first weights: a run, its directory, or a policy made elsewhere
 (``from_sb3(..., learn=True)``)."""
 StartFrom = Origin | Mapping[str, Origin] | None
-"""What to start from: that of all learners of these names, or one by learner."""
+"""The argument ``start_from``: one origin for all learners of the same names, or one by learner."""
 
 
 def starts(

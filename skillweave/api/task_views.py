@@ -51,7 +51,7 @@ class OwnPolicy(Functional):
         part: OwnPart | None = None,
     ) -> None:
         def seen(obs: Array) -> Array:
-            """Return what the policy sees of observations that hold the task's state."""
+            """Return the skill's own observations, without the state of the task."""
             own = view.obs(obs)
             return own if part is None else part.part.see(own)
 

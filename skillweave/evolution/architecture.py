@@ -202,7 +202,7 @@ def _carried(
 
 
 def _parts_of(net: Any, change: Change) -> Sequence[Units | Joint | str]:
-    """Return what changes in a network, one after another: units, the last layer, or filters."""
+    """Return the parts of a network that a mutation changes: units, the last layer, or filters."""
     if change.kind == "layer":
         joint = joint_of(net)
         return [joint] * (change.by > 0 or joint.depth > 1)

@@ -65,7 +65,9 @@ class Collected:
 
 
 class Collector:
-    """N environments, and who acts in them. A function of requests, seeds and ``state``.
+    """A collector: it steps N environments with a policy, and returns each learner's rows.
+
+    Equal requests, seeds and ``state`` give equal rows.
 
     A skill that has goals gets one where a call of it starts, by ``Skill.goals``, until it ends.
     A checkpoint ends no episode: ``state`` holds what is needed to play the open ones again.
@@ -228,7 +230,7 @@ class Collector:
         return found
 
     def state(self) -> dict[str, Array]:
-        """Return what ``restore`` needs. It changes nothing."""
+        """Return the open episodes and calls, for ``restore``; nothing changes."""
         kept = {k: as_numbers(v).copy() for k, v in self.kept.items()}
         kept["obs"] = checksums(self.obs)
         opened = {k: v.copy() for k, v in self.open.items()}
@@ -294,7 +296,7 @@ class Collector:
         self._world = World(rng, self.kept["age"], last, self.overridden)
 
     def _writer(self, rows: int) -> TraceWriter:
-        """Return what writes the trace of ``rows`` steps."""
+        """Return a writer for the trace of the next ``rows`` steps."""
         skill = self.skill
         reads = skill is not None and any(map(skill.defines, skill.methods))
         reads |= self.learning.reads_infos()
@@ -458,7 +460,7 @@ class Collector:
         return steps, found
 
     def _views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
-        """Return what each learner did, by path; ``steps`` are those of ``_judge``."""
+        """Return the rows of each learner, by path; ``steps`` are those of ``_judge``."""
         return self.learning.views(trace, steps)
 
     def _count(self, each: Array) -> list[tuple[int, Array, Array]]:

@@ -171,7 +171,7 @@ class OpenCalls:
         return self._laid_out(values, env)
 
     def _at_decisions(self, trace: Trace, ends: Mapping[str, Array]) -> dict[str, Array]:
-        """Return what calls were decided on, (K, …), by the names of a row."""
+        """Return the observations and selector columns of the decisions of K calls, by name."""
         seen = self.level.seen(trace, "next_obs")
         found = {"obs": seen[ends["row"], ends["env"]]}  # if there is no call
         earlier = ends["decided"] < 0
@@ -195,7 +195,7 @@ class OpenCalls:
         return known(values)  # of a member that has diverged, it may be NaN
 
     def _held(self, name: str) -> Array | None:
-        """Return what open calls were decided on, (N, …); None: none was open before."""
+        """Return a column (N, …) of the decisions whose calls were open before; None: none was."""
         kept = self.kept.get(name)
         return self._shaped.get(self.level.path + name) if kept is None else kept
 

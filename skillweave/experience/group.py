@@ -48,7 +48,7 @@ class Collectors:
         return self._joined(found)
 
     def state(self) -> dict[str, Array]:
-        """Return what ``restore`` needs. It changes nothing."""
+        """Return the states of all collectors, joined, for ``restore``; nothing changes."""
         return joined_states([part.state() for part in self.parts])
 
     def restore(self, state: dict[str, Array]) -> Array:

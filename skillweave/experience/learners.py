@@ -52,7 +52,7 @@ class Alone:
     part: OwnPart | None = None
     """The skill's own part of observations and actions; None: it has all."""
     starts: Starts = field(default_factory=Starts)
-    """How its calls start. Rows in which others act until it may start are not valid."""
+    """Start of the skill's calls. Rows in which others act until it may start are not valid."""
     limit: int | None = None
     """The most steps of a call of the skill; None: its ``max_steps``."""
 
@@ -66,15 +66,16 @@ class Calling:
     """
 
     skills: SkillSet
-    """What its choices mean; those that learn have any policy, ``UntrainedHierarchy`` where one is
-    a hierarchy."""
+    """The skills that the selector chooses from. Those that learn have a placeholder as policy,
+    ``UntrainedHierarchy`` where one is a hierarchy."""
     guide: ActiveGuide | None = None
     """A ready selector that is asked wherever it decides."""
     skill: Skill | None = None
-    """That all of it is, in another hierarchy: its reward and its ends count; None: the task's."""
+    """The skill that this hierarchy is in another one, whose reward and ends count; None: those of
+    the task count."""
     keep_rewards: bool = False
-    """Of each call, keep the reward of every step, so that others may learn from it with a γ of
-    their own."""
+    """Keep the reward of every step of each call, so that other learners may discount it with their
+    own γ."""
 
 
 class OneLearner:
@@ -119,7 +120,7 @@ class OneLearner:
         self._acting.row = out.row + 1
 
     def views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
-        """Return what each learner did, by path.
+        """Return the rows of the one learner, at the path "".
 
         Args:
             steps: as those who act are judged by them.
@@ -256,7 +257,7 @@ class LevelLearners:
             out.write(**{path + name: x for name, x in values.items()})
 
     def views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
-        """Return what each learner did, by path.
+        """Return the rows of each learner, by path.
 
         Args:
             steps: as those who act are judged by them.
@@ -321,7 +322,7 @@ class LevelLearners:
     def _of_skill(
         self, trace: Trace, level: LearningLevel, i: int, acts: Array, end: Array
     ) -> Batch:
-        """Return what a skill that learns did, judged by its own reward and ends."""
+        """Return the rows of a skill that learns, judged by its own reward and ends."""
         skill = level.skills[i]
         part = level.skill_set.part(i)
         goals = level.hierarchy.goals.get(i)

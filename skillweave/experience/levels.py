@@ -74,7 +74,7 @@ def with_learners(
 
 
 def own_memory(memory: Memory) -> Memory:
-    """Return what a skill's own policy remembers, without what it corrects."""
+    """Return the memory of a skill's own policy, without that of the base policy it corrects."""
     own: Memory = memory.get("own", memory)
     return own
 
@@ -95,15 +95,15 @@ class LearningLevel:
 
     skill_set: SkillSet
     hierarchy: CallAndReturn
-    """Of these skills."""
+    """The acting policy of these skills and their selector."""
     memory: Memory
-    """What it remembers, of all environments; changed in place."""
+    """The hierarchy's memory, of all environments; changed in place."""
     learners: Mapping[str, Acting]
-    """By path, all who learn below the first selector."""
+    """All policies that learn below the outermost selector, by path."""
     skill: Skill | None = None
-    """That all of it is, in another hierarchy."""
+    """The skill that this level is in another hierarchy; None: it is the outermost one."""
     path: str = ""
-    """Of these skills, as columns of a trace have it: empty, or ``inner/`` for example."""
+    """Prefix of this level's columns in a trace: empty, or ``inner/`` for example."""
 
     @cached_property
     def goals(self) -> Goals | None:

@@ -44,7 +44,7 @@ class Starts:
     """Names among ``skills``; in a share of the episodes a call of one of them comes last before
     the skill starts."""
     named_share: float = NAMED_SHARE
-    """That share."""
+    """The share of episodes in which a named call comes last."""
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -128,7 +128,7 @@ class OwnSteps:
         return found
 
     def _answers(self, skill: Skill, what: str, part: slice) -> Array:
-        """Return what a skill answers in the rows ``part``, (K,) by time."""
+        """Return a skill's reward or success in the rows ``part``, (K,) by time."""
         acts = self.acts[part]
         infos = self.trace.infos[part]
         every = acts.all()
@@ -288,7 +288,7 @@ class JointInfo(Mapping[str, Any]):
         return any(given)
 
     def get(self, key: str, default: Any = None) -> Any:
-        """Return what environments give under a key in these steps, without what is missing."""
+        """Return a key's values in the ``info`` of these steps, or ``default``: no one has it."""
         given = key in self
         return self[key] if given else default
 

@@ -34,7 +34,8 @@ FEWEST = 5
 SHARE = 0.1
 """Share of the stage's steps that the episodes of a candidate may take."""
 SHORT_SHARE = 0.05
-"""The same share where it would not hold ``LEAST``: there are at most five candidates."""
+"""Share of the stage's steps that a candidate's episodes may take where ``SHARE`` is too little
+for ``LEAST``; there are at most five candidates."""
 CLEARLY = 2.0
 """Standard errors by which a sampling selector must be better than a greedy one to replace it, as
 users expect a greedy one; and training episodes better than all, so that it is said."""
