@@ -341,7 +341,7 @@ class Chain:
     calls: tuple[int, ...]
     """The number of calls that each factor was counted from."""
     interval: tuple[float, float]
-    """Of the estimate, 95 %, by the episodes whose calls count at the scarcest step."""
+    """The 95 % interval of the estimate, by the episodes whose calls count at the scarcest step."""
 
     def __str__(self) -> str:
         """Return the estimate and the product as a sentence."""

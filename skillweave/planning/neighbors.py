@@ -130,7 +130,7 @@ class FeatureMap:
 
     @property
     def acting(self) -> plan.Features:
-        """The same for a plan that acts: a feature far beyond the log is named once."""
+        """The features for a plan that acts: one far beyond the log is named once."""
         function: Callable[..., Any] = self.raw
         if self._codec is None:
             function = Wrapped(self._features, self.raw)

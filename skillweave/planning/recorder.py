@@ -47,7 +47,7 @@ STEPS = {"next_obs": "next_obs", "action": "env_action", "reward": "env_reward"}
 MOST_BYTES = 4 * 2**30
 """The largest log."""
 CALL = ("skill", "elapsed", "end", "length")
-"""What a recorder reads of a player's memory."""
+"""Fields of a hierarchy's memory that a recorder reads."""
 FED_ROWS = 64
 """The most steps of a trace that is fed step by step."""
 FED_BYTES = 2**25
@@ -436,7 +436,7 @@ class TraceFeed:
 
 
 def calls_in(memory: Any, goals: Mapping[int, tuple[str, Goals]], rows: Array) -> Memory:
-    """Return what a ``TraceFeed`` takes of a hierarchy's memory.
+    """Return the fields of a hierarchy's memory that a ``TraceFeed`` reads.
 
     These are ``skill``, ``elapsed``, ``end`` and perhaps ``length``, (k,) each, and the goals of
     skills that have some, (k, *goal_shape).

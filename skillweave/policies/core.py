@@ -34,7 +34,7 @@ class CallEnd(IntEnum):
 
 
 RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = map(int, CallEnd)
-"""The same as plain integers, with which arrays are compared six times as fast."""
+"""``CallEnd`` as plain integers, with which arrays are compared six times as fast."""
 
 
 def end_with_episode(end: Array, over: Array) -> None:
@@ -191,7 +191,7 @@ class World:
     overridden: Array | None = None
     """(N,) bool, set where a reflex acts."""
     trace: Any = None
-    """Where those who learn write what they choose, ``write(rows, **columns)``; None: nowhere."""
+    """Writer of learning policies' columns, ``write(rows, **columns)``; None: none is kept."""
 
 
 @dataclass(slots=True)

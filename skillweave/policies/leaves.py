@@ -133,7 +133,7 @@ class OnnxNetwork(RowPolicy):
     file: bytes
     sees: Space
     acts: Space
-    """Of its actions; where it has parts, the file gives them as rows, ``Space.flat``."""
+    """The space of its actions; where it has parts, the file gives them as rows, ``Space.flat``."""
     choices: int = 0
     """The width of its mask; 0: it takes none."""
     memory: int = 0

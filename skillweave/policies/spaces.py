@@ -48,7 +48,7 @@ class Space:
     high: Array | None = None
     """(*shape) or one for all: the highest numbers, or the last choices."""
     parts: dict[str, Space] | None = None
-    """Of a Dict or Tuple, in order."""
+    """The parts of a Dict or Tuple, in order; None: another space."""
 
     def __post_init__(self) -> None:
         if self.parts is not None or self.kind in ("Dict", "Tuple"):

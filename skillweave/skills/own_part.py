@@ -331,18 +331,18 @@ class OwnPart:
                 "of which nothing is left: leave out rest"
             )
         self.action_space: Space[Any] = self.written_space
-        """Of its own actions."""
+        """The space of the skill's own actions."""
         spaces = space_of(action_space), space_of(self.written_space)
         self.part = Slice(*spaces, axes=len(observation_space.shape or ()), who=who, **how)
-        """What acts."""
+        """The part that acts."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return what was declared as JSON."""
+        """Return the declaration of the part as JSON."""
         content = part_to_json(self._skill, self._rest, self.who)
         return content if self.base is None else content | {"policy": as_json(source_of(self.base))}
 
     def _fit_sees(self, sees: Any) -> dict[str, Any]:
-        """Return what it sees, as of ``Part``."""
+        """Return the fields ``inputs`` and ``sees`` of ``Slice``: the skill's own observations."""
         mapping = declared_sees(sees, self.who)
         inputs = fitted_inputs(mapping, self.whole_observation_space, self.who, {})
         spaces = {name: self._input_space(given) for name, given in inputs.items()}

@@ -47,9 +47,9 @@ class SkillSet(LimitedCalls):
     """Skills act greedily; else they sample."""
 
     call_cost: float = 0.0
-    """What a selector that learns pays for each call, in units of reward."""
+    """Cost of each call for a selector that learns, in units of reward."""
     interruption: Interruption | None = None
-    """When the selector cuts a call; None: never."""
+    """Rule by which the selector cuts a call; None: it never does."""
     parts: tuple[OwnPart | None, ...] = ()
     """The own part of each skill's observations and actions, None: it has all; (): no skill has
     one."""

@@ -65,16 +65,16 @@ SCORE_ALONE = 'evaluate(skill="go_to") scores a skill alone'
 
 @dataclass(frozen=True)
 class Details:
-    """What an evaluation knows beside its scores, and does not save; None: it has none."""
+    """Details of an evaluation beside its scores, which are not saved; None: it has none."""
 
     logs: dict[str, CallLog] | None = None
     """The calls of each level, by its path."""
     handovers: tuple[str, ...] = ()
     """Sentences on skills that seldom succeed after one other skill."""
     goals: Array | None = None
-    """Of a skill that acted alone: the goal of each episode, (episodes, …)."""
+    """The goal of each episode, (episodes, …), where a skill acted alone."""
     reached: Array | None = None
-    """Of a skill that acted alone: the success of each episode's call, (episodes,) bool."""
+    """The success of each episode's call, (episodes,) bool, where a skill acted alone."""
 
 
 @dataclass(frozen=True)
@@ -544,7 +544,7 @@ K = TypeVar("K")
 
 
 def _known(value: K | None, missing: str) -> K:
-    """Return what an evaluation knows; where it is ``missing``, raise an error."""
+    """Return a detail of an evaluation; None raises an error with the text ``missing``."""
     if value is None:
         raise DeclarationError(missing)
     return value

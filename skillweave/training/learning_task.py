@@ -1,4 +1,4 @@
-"""What is learnt in a stage: who learns and who acts, with their environments and collectors."""
+"""The learning task of a stage: its learner and acting policies, environments and collectors."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from skillweave.training.role import Role
 
 @dataclass(frozen=True)
 class LearningTask:
-    """What is learnt in a stage, and who acts in its environments."""
+    """The learning task of a stage, and the policies that act in its environments."""
 
     role: Role
-    """Who learns; of a hierarchy that learns together, its selector."""
+    """The role that learns; of a hierarchy that learns together, its selector."""
     who: Alone | Calling
-    """Who acts; a guide may decide in the selector's place."""
+    """The acting policies; a guide may decide in the selector's place."""
     roles: Mapping[str, Role] | None = None
     """The roles of a level that learns together, and of those below it, by path; None: one learns
     alone."""
@@ -34,7 +34,7 @@ class LearningTask:
 
     @property
     def called(self) -> SkillSet | None:
-        """What is called in the outermost hierarchy; None: it is another learner's task."""
+        """The skills called in the outermost hierarchy; None: it is the task of another learner."""
         who = self.who
         return who.skills if isinstance(who, Calling) and who.skill is None else None
 

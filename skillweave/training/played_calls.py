@@ -149,7 +149,7 @@ class PlayedCalls:
         return recorders
 
     def _calls(self, path: str, played: PlayedStep) -> Memory:
-        """Return what a level's calls did in a step."""
+        """Return the calls of a level in a step, by columns of a recorder."""
         if self.alone is not None and not path:
             return self._of_alone(self.alone, played)
         if not self.declared:
@@ -170,7 +170,7 @@ class PlayedCalls:
         return calls
 
     def _of_alone(self, skill: Skill, played: PlayedStep) -> Memory:
-        """Return what the calls of a skill that acts alone did in a step."""
+        """Return the calls of a skill that acts alone, by columns of a recorder."""
         rows, step = played.rows, played.step
         tau = self._tau[rows]
         tau[step.elapsed == 1] = WAITS

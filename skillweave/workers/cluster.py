@@ -40,14 +40,14 @@ class Ray:
     """
 
     collectors: AtLeastOne | None = None
-    """How many; the environments of a stage are shared out equally, or the members of a population.
+    """Number of collectors; they share a stage's environments equally, or a population's members.
     None: as many as there would be processes without Ray. A run keeps the number, as results depend
     on it."""
     address: Annotated[str, Check("a text such as '10.0.0.1:6379'")] | None = None
     """``host:port`` of a cluster's head, ``ray://host:port``, or ``auto``: the one that runs on
     this machine. None: what RAY_ADDRESS says, or else a new one of this machine alone."""
     cpus: Positive = 1.0
-    """Of the cluster's CPUs, what each collector takes."""
+    """CPUs of the cluster that each collector takes."""
     patience: NonNegative = 300.0
     """Seconds to wait while the cluster has no room for all collectors, or lost some of it."""
 

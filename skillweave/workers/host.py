@@ -51,7 +51,7 @@ class Worker:
     """Somebody elsewhere who has a collector: it does one task after another."""
 
     tries = 1
-    """How often a lost one is made again before a request fails."""
+    """Number of times that a lost worker is made again before a request fails."""
     who = ""
     """Its name in messages; ``Workers`` gives it."""
 
@@ -300,7 +300,7 @@ class WorkerCollectors(Workers, Collectors):
         return found
 
     def state(self) -> dict[str, Array]:
-        """Return what ``restore`` needs. Only a worker that is lost meanwhile can change."""
+        """Return the states of all workers' collectors, joined, for ``restore``."""
         return joined_states(self.states())
 
     def restore(self, state: dict[str, Array]) -> Array:

@@ -71,7 +71,7 @@ class Played:
     score: Evaluation
     log: PlayedEpisodes
     colors: dict[str, RGB]
-    """Of each of the log's labels."""
+    """The color of each of the log's labels."""
     with_goals: dict[str, Skill]
     """The skills with goals, by path."""
 
