@@ -585,7 +585,7 @@ class TrainedPolicy:
         info: Sequence[str] = (),
         quiet: bool = False,
     ) -> Evaluation:
-        """Score it in whole episodes.
+        """Score the policy in whole episodes.
 
         Args:
             episodes: whole episodes.
@@ -923,7 +923,7 @@ class TrainedPolicy:
         return self.hierarchy.spec
 
     def _check_written(self) -> None:
-        """Raise a RunError where this is not what is written under ``path``."""
+        """Raise a RunError where the policy is a planned one, which the run's files do not hold."""
 
     def _check_logged(self) -> None:
         """Raise a DeclarationError where evaluations do not show whole calls."""
@@ -947,6 +947,7 @@ class TrainedPolicy:
         return self.policy if skill is None else self._alone(skill)
 
     def _alone(self, skill: str) -> SkillAlone:
+        """Return the policy of one skill of the hierarchy, which acts alone."""
         if not isinstance(self.policy, HierarchyPolicy):
             raise DeclarationError("this is a plain agent: it has no skills")
         self.hierarchy.skill(skill)
@@ -1249,6 +1250,7 @@ def _labels_of(
     colors = {path: color_of(i, s.color) for i, (path, s) in enumerate(skills.items())}
 
     def label(memory: Memory) -> tuple[str, RGB, str]:
+        """Return the acting skill's path, colour and goal, by the policy's memory."""
         if roles is None:
             return AGENT, color_of(0, None), ""
         acting = policy.policy if isinstance(policy, SkillAlone) else policy

@@ -46,7 +46,7 @@ PLAYED = 64
 
 @dataclass
 class Collected:
-    """The answer to a request: what learners learn from, and numbers for people."""
+    """Result of a request: the rows of each learner, and statistics of episodes for reports."""
 
     batches: dict[str, Batch]
     """By path, what each learner did; \"\" where there is one."""
@@ -161,7 +161,7 @@ class Collector:
 
     @property
     def elapsed(self) -> Array:
-        """(N,) steps of the calls of the skill that acts, or of the episodes."""
+        """Return the steps (N,) of the calls of the skill that acts, or of the episodes."""
         return self.kept["age" if self.search is None else "elapsed"]
 
     def start(self, seeds: Seeds) -> None:
@@ -173,7 +173,7 @@ class Collector:
             self.begun = True
 
     def collect(self, request: Request) -> Collected:
-        """``request.rows`` steps of each environment."""
+        """Step each environment ``request.rows`` times, and return each learner's rows."""
         before = self.engine.steps_made
         self._info_keys = set()
         self._ended = []
@@ -277,7 +277,7 @@ class Collector:
         return self._begin_anew(ids)
 
     def finish(self, _: None = None) -> None:
-        """Check at the end of training what it has left in the environments."""
+        """Check at the end of training that it has left nothing in the environments."""
         self.engine.finish()
 
     def close(self) -> None:
@@ -287,7 +287,7 @@ class Collector:
     # Steps are made -----------------------------------------------------------------------------
 
     def _prepare(self, request: Request) -> None:
-        """Act by this request from now on."""
+        """Load the parameters and seeds of a request, by which the collector acts from now on."""
         self.learning.begin(request, self.elapsed)
         self._greedy = request.greedy
         self._goal_rng = (request.seeds / "goals").numpy()
@@ -307,7 +307,7 @@ class Collector:
         return writer
 
     def _step(self, out: TraceWriter) -> None:
-        """Step every environment, and write what happened."""
+        """Step every environment, and write the step into the trace."""
         obs = self.obs
         mask = self.engine.mask()
         rows = self._all
@@ -370,7 +370,7 @@ class Collector:
         return action
 
     def _begun(self, end: Array, over: Array, waiting: Array, step: Step) -> Array:
-        """Let new calls begin in episodes that go on, and the search go on where it has to.
+        """Start new calls in episodes that go on, and continue the search for a start.
 
         Args:
             end: (N,), why calls ended.
@@ -439,7 +439,7 @@ class Collector:
     # They are judged ----------------------------------------------------------------------------
 
     def _judge(self, trace: Trace) -> tuple[Batch, list[tuple[int, Array, Array]]]:
-        """Judge the steps of a trace.
+        """Judge the steps of a trace by the acting skill, or by the task.
 
         Returns:
             The steps as those who act are judged by them, and the episodes that ended in them:
@@ -480,14 +480,14 @@ class Collector:
         return found
 
     def _forget(self, ids: Array) -> None:
-        """Episodes of environments ``ids`` (k,) have just begun."""
+        """Clear the memory of environments ``ids`` (k,), whose episodes have just started."""
         self.kept["age"][ids] = 0
         if self._last_actions is not None:
             self.kept["last_action"][ids] = self._last_actions.start(len(ids))
         self._begin_call(ids, episodes=True)
 
     def _begin_call(self, ids: Array, *, episodes: bool) -> None:
-        """Let a new call begin in environments ``ids`` (k,), perhaps a new episode."""
+        """Start a new call in environments ``ids`` (k,), perhaps a new episode."""
         restart(self.policy, self.memory, ids)
         if self._goals is not None:
             self.kept["needs_goal"][ids] = True
@@ -495,11 +495,12 @@ class Collector:
             self.search.begin(ids, self.obs, episodes=episodes)
 
     def _clear(self, ids: Array) -> None:
-        """Nothing of environments ``ids`` (k,) is left of the requests before."""
+        """Clear the numbers that requests keep of environments ``ids`` (k,), which were reset."""
         for name in self.after_request:
             self.kept[name][ids] = 0
 
     def _begin_anew(self, ids: Array) -> Array:
+        """Reset environments ``ids`` (k,) and clear their memory; return them."""
         if len(ids):
             self.obs = self.obs.copy()
             self.obs[ids] = self.engine.reset_some(ids)
@@ -507,7 +508,7 @@ class Collector:
         return ids
 
     def _tell(self, row: int, ids: Array, info: Mapping[str, Any]) -> None:
-        """Keep the numbers of the episodes of environments ``ids`` (k,), which are over.
+        """Record the episodes that have ended in environments ``ids`` (k,), for reports.
 
         Args:
             row: of the step.
@@ -547,7 +548,7 @@ def _checksum(state: Mapping[str, Array]) -> int:
 
 
 def joined_from(collectors: Sequence[Collector], engine: Engine, acting: Acting) -> Collector:
-    """Several collectors of one kind as one, over an engine of all their environments."""
+    """Return several collectors of one kind as one, over an engine of all their environments."""
     found: Collector = collectors[0].like(engine, acting)
     found.log_info = collectors[0].log_info
     for name, rows in found.kept.items():

@@ -237,7 +237,7 @@ class OpenCalls:
         )
 
     def _keep(self, trace: Trace) -> None:
-        """Keep what was decided of calls that are still open."""
+        """Keep the decisions of calls that are still open, for the next request."""
         env = np.flatnonzero(self.kept["open"] & (self._decided >= 0))
         for name in DECIDED_ON.values():
             if (values := self._decided_on(trace, name)) is None:
@@ -260,7 +260,7 @@ DECIDED_ON = {
 
 
 def as_logits(chances: Array, may: Array) -> Array:
-    """Logits of choices that are as likely as that, but for a share that is uniform.
+    """Return the logits of a guide's choices, of which a small share is uniform.
 
     Args:
         chances: (…, choices).

@@ -38,7 +38,7 @@ CALLS = (*OF_STEP, "elapsed", "skill", "call_elapsed", "call_end", "call_length"
 
 @dataclass(frozen=True)
 class Alone:
-    """One policy acts: that of a plain agent, or of a skill that learns apart. A row is a step.
+    """One acting policy: of a plain agent, or of a skill that learns apart; a row is a step.
 
     A skill's ``termination`` terminates the episode (nothing is worth anything after it), its
     limit truncates it (its value goes on). Then comes a real reset, but for a call that ended at
@@ -59,7 +59,7 @@ class Alone:
 
 @dataclass(frozen=True)
 class Calling:
-    """A selector calls skills, and they may learn from the same steps; see ``LevelLearners``.
+    """A selector that calls skills, which may learn from the same steps; see ``LevelLearners``.
 
     No environment waits for another: where a call is over, the selector decides again, while the
     other calls go on. A call that is open when the rows are full goes on in the next request.
@@ -104,7 +104,7 @@ class OneLearner:
         self.overrides = bool(who.reflexes)
 
     def begin(self, request: Request, elapsed: Array) -> None:
-        """Act by this request from now on; ``elapsed`` (N,) are steps of calls so far."""
+        """Act by a request from now on; ``elapsed`` (N,) are steps of calls so far."""
         assert self._acting is not None
         self._acting.begin(request)
         self._record = request.record
@@ -197,7 +197,7 @@ class LevelLearners:
                     self.values[f"{level.path}action"] = range(level.hierarchy.choices)
 
     def begin(self, request: Request, elapsed: Array) -> None:
-        """Act by this request from now on; ``elapsed`` (N,) are steps of the episodes so far."""
+        """Act by a request from now on; ``elapsed`` (N,) are steps of the episodes so far."""
         self._record, self._gammas = request.record, dict[str, Array]()  # by path, (N,)
         if self._acting is not None:
             self._begin("", self._acting, request)
@@ -227,7 +227,7 @@ class LevelLearners:
         return any(s.defines(method) for s in judges for method in ("reward", "termination"))
 
     def write(self, out: TraceWriter, end: Array, whole: bool) -> None:
-        """Write which calls run after a step, and why others ended.
+        """Write into the trace which calls run after a step, and why others ended.
 
         Args:
             out: the trace.
@@ -267,7 +267,7 @@ class LevelLearners:
         return dict(self._of_level(trace, self.root, steps, end, end != RUNNING))
 
     def log(self, trace: Trace, info: Sequence[str]) -> Batch:
-        """Return the steps with what calls did in them; ``info`` are keys that are logged."""
+        """Return a trace's steps with their calls, for a log of calls; ``info`` are its keys."""
         over = trace["call_end"] != RUNNING
         skills = self.root.skills
         goals = (f"{skill.name}/goal" for skill in skills)
@@ -278,7 +278,7 @@ class LevelLearners:
     def _of_level(
         self, trace: Trace, level: LearningLevel, steps: Batch, end: Array, closes: Array
     ) -> Iterator[tuple[str, Batch]]:
-        """Yield what the learners of a level did, by path, and of those below it.
+        """Yield the rows of a level's learners, by path, and of those below it.
 
         Args:
             steps: see ``OpenCalls.calls_of``.
@@ -302,7 +302,7 @@ class LevelLearners:
 
     @staticmethod
     def _of_critic(trace: Trace, level: LearningLevel, steps: Batch) -> Batch:
-        """Return all steps of a level, for its critic."""
+        """Return the rows of a level's critic: all steps of the level."""
         acts = steps["valid"]
         running = trace[level.path + "skill"]
         seen = {name: level.seen(trace, name) for name in ("obs", "next_obs")}
@@ -361,7 +361,7 @@ class LevelLearners:
 def _completed(
     batch: Batch, space: gym.Space[Any], before: tuple[Array, Array] | None, goes_on: Array
 ) -> Batch:
-    """Return a batch with actions, also where nobody acted, and with what a network remembered.
+    """Return a learner's rows, with actions in all of them, and a recurrent network's state.
 
     Args:
         batch: (T, N).

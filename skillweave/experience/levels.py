@@ -24,7 +24,7 @@ from skillweave.types import Array, Policy
 
 @dataclass(frozen=True)
 class UntrainedHierarchy:
-    """Stands for the policy of a skill that is a hierarchy and learns."""
+    """A placeholder for the policy of a skill that is a hierarchy and learns."""
 
     skills: SkillSet
     """Those that learn have any policy."""
@@ -53,6 +53,7 @@ def with_learners(
     """
 
     def policy_of(skill: Skill, policy: Any) -> Any:
+        """Return the acting learner of a skill, or its ready policy."""
         name = path + skill.name
         if name in learners:
             return Learning(learners[name], name)
@@ -107,7 +108,7 @@ class LearningLevel:
 
     @cached_property
     def goals(self) -> Goals | None:
-        """Its own, as a skill that has goals."""
+        """The level's own goals, as a skill that has goals; None: it has none."""
         return goals_of(self.skill)
 
     @property

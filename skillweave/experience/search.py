@@ -53,12 +53,12 @@ class Starts:
 
     @property
     def named(self) -> tuple[str, ...]:
-        """Those of ``after`` that can act already."""
+        """The names in ``after`` of skills that can act already."""
         return tuple(name for name in self.names if name in self.after)
 
     @property
     def draws(self) -> bool:
-        """Calls come first, and how many is drawn for each episode."""
+        """True if calls of other skills come first, a number that is drawn for each episode."""
         return self.skills is not None and (self.calls > 0 or bool(self.named))
 
     def search(self, skill: Skill | None, engine: Engine) -> Search | None:
@@ -213,17 +213,17 @@ class Search:
 
     @property
     def given_up(self) -> Array:
-        """(N,) bool, environments in which the skill cannot start, as it seems."""
+        """Return the environments in which the skill seems unable to start, (N,) bool."""
         found: Array = self.kept["searched"] > PATIENCE
         return found
 
     def _runs(self, ids: Array) -> Array:
-        """(k,) bool, a call of another skill runs."""
+        """Return where a call of another skill runs, (k,) bool."""
         runs: Array = self.memory["end"][ids] == RUNNING
         return runs
 
     def _stop(self, ids: Array) -> None:
-        """End calls of others in environments ``ids`` (k,): the skill starts, or an episode."""
+        """End other skills' calls in environments ``ids`` (k,): the skill or an episode starts."""
         if self.starts.skills is not None:
             restart(self._policy, self.memory, ids)
 
@@ -301,7 +301,7 @@ class Search:
             )
 
     def _sought(self) -> str:
-        """Describe what searched for a start."""
+        """Return words on the search for a start, for messages."""
         by = "random acting"
         if self.starts.skills is not None:
             by = f"calling {', '.join(map(repr, self.starts.names))}"

@@ -15,7 +15,7 @@ from skillweave.types import Array
 
 
 class TraceWriter:
-    """Writes the rows of a trace, from the first to the last.
+    """A writer of a trace, from the first row to the last.
 
     A column exists from its first value on; what is not written has the column's ``fill``.
 

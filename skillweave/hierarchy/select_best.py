@@ -110,6 +110,7 @@ def _scores(
         max_steps = max(1, (entry.steps or 0) // num_envs)
 
     def score(decided: Roles, policies: Policies) -> Evaluation:
+        """Return the evaluation of one candidate, in the same episodes as the others."""
         policy = assembled(decided, policies, level.path)
         return evaluate(
             policy,
@@ -171,7 +172,7 @@ def resolve_greedy(roles: Roles, run: RunDirectory) -> Roles:
 
 
 def _with_sampling(level: Level, skills: bool, selector: bool) -> Level:
-    """Set whether skills and selector sample, where a level leaves that open."""
+    """Return a level with skills and selector greedy or sampling, where it leaves that open."""
     choice = level.selection
     decided = replace(
         choice,

@@ -154,7 +154,7 @@ class Evaluation:
         return _known(self.details.reached, f"{missing}: {SCORE_ALONE}")
 
     def comparing(self, features: Any) -> Evaluation:
-        """Return the same, with logs whose calls are compared by a hierarchy's ``features``."""
+        """Return the evaluation with the ``features`` by which its logs compare calls."""
         logs = dict(self.details.logs or {})
         logs[""] = replaced(logs[""], features=features)
         return replaced(self, details=replaced(self.details, logs=logs))
@@ -239,7 +239,7 @@ class Evaluation:
         return f"<Evaluation: {self}>"
 
     def _repr_html_(self) -> str:
-        """Return the same as ``for_people``, for notebooks."""
+        """Return the text of ``for_people`` as HTML, for notebooks."""
         rows = [*map(cells_of, skill_rows(self.skills))]
         tables = [table(TITLES, rows)] if rows else []
         lines = [*reflex_lines(self.reflexes, sum(self.lengths)), *self._hints()]
@@ -398,7 +398,7 @@ def _describe(spec: EnvSpec) -> tuple[int | None, float | None, bool]:
 
 
 def _with_notice(moments: Iterator[PlayedStep], name: str, most: int) -> Iterator[PlayedStep]:
-    """Yield what is played; give a notice once where an episode seems never to end.
+    """Yield played steps; give a notice once where an episode seems never to end.
 
     Args:
         name: of the environment.
@@ -464,7 +464,7 @@ def _scored(
     threshold: float | None,
     calls: PlayedCalls,
 ) -> Evaluation:
-    """Play all episodes and return their scores."""
+    """Play all episodes of an evaluation, and return their scores."""
     returns = np.zeros(episodes)
     lengths = np.zeros(episodes, np.int64)
     cut = 0

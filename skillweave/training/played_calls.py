@@ -139,6 +139,7 @@ class PlayedCalls:
         }
 
     def _recorders(self, num_envs: int) -> dict[str, Recorder]:
+        """Return a recorder for each level, by its path."""
         recorders = {
             path: Recorder(skills, self._spaces, num_envs, path=path, above=above, **self._how)
             for path, (skills, above) in self._levels.items()
