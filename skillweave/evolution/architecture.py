@@ -184,7 +184,7 @@ def _carried(
     change: Change,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
-    """Return a family's fields in the new layout."""
+    """Return a parameter group's weights and moments in the layout of the changed network."""
     names = (*before.weights, *before.moments, before.count)
     lead = state[names[0]].shape[:-1]
     # New parameters begin with moments of 0 after 0 steps; the others keep theirs.

@@ -125,7 +125,7 @@ class EvolvingPopulation:
 
     @property
     def over(self) -> bool:
-        """Return whether all generations are complete, or the stage ends before.
+        """Return whether all generations are complete, or the stage ends early.
 
         It ends when the target is reached, the budget is spent, or a callback requests it.
         """
@@ -135,7 +135,7 @@ class EvolvingPopulation:
 
     @property
     def _good(self) -> bool:
-        """Return whether the target is reached."""
+        """Return whether the stage's target is reached."""
         target = self.entry.target
         best = self.best
         return target is not None and best is not None and best.fitness >= target.at_least

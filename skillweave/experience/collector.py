@@ -76,8 +76,8 @@ class Collector:
         engine: the environments; they are reset by ``start``, or stand where ``restore`` puts them.
         acting: the plain agent, the skill, or the selectors that learn; None: the guide decides, or
             only ``like`` is to act.
-        who: acts.
-        learners: by path, all others who learn: ``skill``, ``inner/skill``, ``inner/selector``;
+        who: the policies that act.
+        learners: by path, all others that learn: ``skill``, ``inner/skill``, ``inner/selector``;
             ``skill_critic`` and ``inner/skill_critic`` say what skills are worth. None: one alone
             learns, at the path ""; else a selector has the path ``selector``.
         margins: by the paths of critics: calls end where a new decision is worth this much more.
@@ -101,11 +101,11 @@ class Collector:
         self._together = learners is not None
         self._goals = goals_of(self.skill)
         self.obs: Array = np.empty(0)
-        """(N, *obs_shape), what to act on next."""
+        """(N, *obs_shape), the observations to act on next."""
         self.open: dict[str, Array] = {}
-        """What is kept of open calls, (N, …) each, whose shape is known when one begins."""
+        """Numbers of open calls, (N, …) each, whose shape is known only when a call starts."""
         self.search: Search | None = None
-        """What leads to where a skill may start; None: it starts wherever episodes do."""
+        """The search for a start of the skill; None: it starts wherever episodes do."""
         self.limit = None if self.skill is None else self.skill.max_steps
         """The most steps of a call of the skill; None: any number."""
         self.learning: OneLearner | LevelLearners
@@ -122,7 +122,7 @@ class Collector:
             **flat(self.memory, "player."),
             **self.learning.kept,
         }
-        """What is kept of each environment, (N, …) each; changed in place."""
+        """State of each environment between requests, (N, …) each; changed in place."""
         self.values = prefixed("player", self.policy.values()) | self.learning.values
         """By names of these, what numbers that choose among something may be, or whose goals."""
         self.after_request = {"sums", *self.learning.kept}
@@ -151,7 +151,7 @@ class Collector:
         """Keys of ``info`` in the log of calls; None: none is kept."""
         self._info_keys: set[str] = set()
         self._ended: list[tuple[int, Array, Array]] = []
-        """Of episodes that ended in a request: row, environments, and numbers without sums."""
+        """Episodes that ended in a request: row, environments, and numbers without sums."""
 
     def like(self, engine: Engine, acting: Acting) -> Collector:
         """Return a collector of the same kind over other environments."""

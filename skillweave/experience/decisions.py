@@ -46,7 +46,7 @@ class OpenCalls:
             "discount": np.zeros(n),  # γ^τ
             "tau": np.zeros(n, np.int64),
         }
-        """Of each environment, (N, …); changed in place."""
+        """State of the open call in each environment, (N, …) each; changed in place."""
         if not hierarchy.goals:  # else its shape is that of the selector's choices
             self.kept["action"] = np.zeros(n, np.int64)  # the choice
         if self.memory_size:

@@ -27,13 +27,13 @@ class UntrainedHierarchy:
     """A placeholder for the policy of a skill that is a hierarchy and learns."""
 
     skills: SkillSet
-    """Those that learn have any policy."""
+    """The skills; the policies of those that learn are not used."""
     selector: Policy | None
-    """None: it learns."""
+    """The ready selector; None: it learns."""
     guide: ActiveGuide | None = None
-    """A ready selector beside it."""
+    """A ready selector beside the learning one."""
     goals: Goals | None = None
-    """Its own, as a skill that has goals."""
+    """The hierarchy's own goals, as a skill that has goals; None: it has none."""
 
     @property
     def action_space(self) -> gym.Space[Any]:

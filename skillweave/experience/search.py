@@ -99,7 +99,7 @@ class Search:
             "found": np.zeros(n, bool),  # it ever might
             "calls_left": np.zeros(n, np.int64),  # that come first; −1: to be drawn
         }
-        """What is kept of each environment, (N, …) each; changed in place."""
+        """State of the search in each environment, (N, …) each; changed in place."""
         if self._named:
             self.kept["named"] = np.zeros(n, bool)  # the last of these calls must be named
             self.kept["sought"] = np.zeros(n, np.int64)  # steps until one ended; −1: one has
@@ -108,7 +108,7 @@ class Search:
         self.holds = False
         """The last action counts for who is called."""
         if starts.skills is not None:
-            # The last action is in the ``World``: others act, too.
+            # Not outermost: the collector keeps the last action, as the skill itself acts, too.
             skills = starts.skills if self._named else replace(starts.skills, greedy=False)
             self._policy = acting_policy(skills, outermost=False)
             self._hierarchy = within(self._policy)

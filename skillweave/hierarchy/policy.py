@@ -25,7 +25,7 @@ from skillweave.types import Array, Policy
 
 @checked_names
 class HierarchyPolicy(Functional):
-    """A selector and its skills as one policy; its memory is that of ``policies.Hierarchy``.
+    """A selector and its skills as one policy; its memory is that of ``CallAndReturn``.
 
     Args:
         selector: chooses a row of the skills.

@@ -661,6 +661,7 @@ class Blame:
         return f"{text}, {between}, or {self.after!r} has to end where {self.skill!r} works"
 
     def _difference(self) -> str:
+        """Return words on the number that differs most between the starts of calls."""
         if self.place is None:
             return ""
         one, other = (f"{mean:.2g}" for mean in self.means)

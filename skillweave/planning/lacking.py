@@ -198,6 +198,7 @@ def names_of(arrows: Iterable[Arrow]) -> str:
 
 
 def _sentence(missing: Sequence[Predicate], log: CallColumns) -> str:
+    """Return a sentence on predicates that hold in no step of a log."""
     names = " and ".join(repr(p.name) for p in missing[:3])
     verb = "holds" if len(missing) == 1 else "hold"
     text = f"{names} never {verb} in the {log.steps:,} steps of the log, so no plan leads there"

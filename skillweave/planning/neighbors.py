@@ -177,6 +177,7 @@ class FeatureMap:
         return value
 
     def _checked_places(self, places: Any, size: int) -> list[int]:
+        """Return places of features in the flat observation, checked; None: all."""
         if places is None:
             return list(range(size))
         whole = [p for p in places if isinstance(p, int | np.integer) and 0 <= p < size]

@@ -215,7 +215,7 @@ def successes(skills: Iterable[Skill]) -> dict[str, Predicate]:
 
 
 def _of(join: Callable[..., Array], name: str, *parts: Predicate) -> Predicate:
-    """Return the predicate that joins what the ``parts`` answer."""
+    """Return the predicate that joins the answers of its parts."""
     reads: Reads = "obs" if all(part.reads == "obs" for part in parts) else "step"
     ask = Predicate.at if reads == "obs" else Predicate.holds
     return Predicate(lambda x: join(*(ask(part, x) for part in parts)), name, reads)

@@ -191,7 +191,7 @@ class Input:
     shape: tuple[int, ...]
     """The shape of the input for one environment."""
     scalings: tuple[Affine, ...] = ()
-    """In their order."""
+    """Scalings of the input, applied in this order."""
     reshaped: bool = False
     """It is brought to its shape: one number with or without an axis of its own."""
 
@@ -732,7 +732,7 @@ class Mapped(RowPolicy):
                 f"{self.who}: chunk needs actions of one array, but they are of {str(space)[:300]}"
             )
         self.takes = [take for one in (self.inputs or {}).values() for take in one.takes]
-        """What its inputs are joined of."""
+        """Sources that the inputs are made of."""
         goals, last = (
             {take.shape for take in self.takes if take.source == source}
             for source in ("goal", "last_action")

@@ -310,7 +310,7 @@ class StateMachine(Rule):
     """
 
     states: dict[str, tuple[str, ...]]
-    """By name of the state, its skills, the best first."""
+    """The skills of each state, the best first, by the state's name."""
     first: str
     """The state in which episodes start."""
     transitions: tuple[tuple[str, str, str | Callable[..., Any]], ...] = code("a Step to (n,) bool")

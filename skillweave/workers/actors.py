@@ -155,7 +155,7 @@ class ActorWorker(Worker):
         self._due = deque[Any]()
         self._lost = ""
         self.place: dict[str, Any] = {}
-        """Its node and process, and what runs there."""
+        """The actor's node, process and versions."""
         self._versions: Any = None
 
     def begin(self) -> None:

@@ -171,7 +171,7 @@ class Workers:
         for number, worker in enumerate(workers):
             worker.who = f"{name}: worker {number}{self._whose(number)}"
         self._past: list[tuple[str, Sequence[Any]]] = []
-        """What brings workers to where they stand: a start or states, then tasks."""
+        """Tasks that bring a new worker to the present state: a start or states, then requests."""
         try:
             for worker in self._workers:
                 worker.begin()
