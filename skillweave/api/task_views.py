@@ -82,7 +82,7 @@ class ViewedSelector(Viewed, Selector):
         return self.policy.chances(memory, rows, self.view(obs), may)
 
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
-        """Return the choices that the selector allows; see ``Selector``."""
+        """Return the choices that the selector leaves; see ``Selector``."""
         return self.policy.ahead(memory, rows, may)
 
     def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:

@@ -190,7 +190,7 @@ class EvolvingPopulation:
         return self.best.policy
 
     def _until(self, spent: int) -> tuple[int, int]:
-        """Return the steps of each member at this generation's end, and the end of schedules.
+        """Return the steps of each member at the generation's end, and at the end of schedules.
 
         The budget includes fitness measurements, which are assumed to take as many steps as the
         last one.

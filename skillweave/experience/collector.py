@@ -390,7 +390,7 @@ class Collector:
         return np.union1d(np.setdiff1d(over, again), lost)
 
     def _goal(self, rows: Array) -> Array | None:
-        """Return the goals of all environments, (N, *goal_shape), after those of new calls.
+        """Return the goals of calls in all environments, (N, *goal_shape); new calls draw theirs.
 
         Args:
             rows: (k,) environments in which the skill acts.
@@ -540,7 +540,7 @@ def as_numbers(x: Array) -> Array:
 
 
 def _checksum(state: Mapping[str, Array]) -> int:
-    """Return a number that follows from all arrays of a state."""
+    """Return one checksum of all arrays of a collector's state."""
     found = 0
     for array in state.values():
         found = zlib.crc32(array.tobytes(), found)
