@@ -46,7 +46,7 @@ class RunCalls:
             info: keys; those of earlier calls are added, so that all calls can be joined.
 
         Raises:
-            RunError: what is recorded could not be kept, or the skills' code is missing, which the
+            RunError: recorded calls could not be kept, or the skills' code is missing, which the
                 calls so far were recorded with.
         """
         if self._is_own():

@@ -201,7 +201,7 @@ class Collector:
         """Play one episode in each environment, from its start.
 
         Args:
-            request: who acts; ``rows`` does not count.
+            request: the parameters to act by; ``rows`` does not count.
             max_steps: steps after which an episode is cut.
 
         Returns:

@@ -366,9 +366,9 @@ def _completed(
     Args:
         batch: (T, N).
         space: of the actions.
-        before: what a recurrent network remembered before, (N, M), and (N,) bool, that was
-            nothing; None: it is not recurrent.
-        goes_on: (T, N) bool, it remembers what was before the next row.
+        before: a recurrent network's state before these rows, (N, M), and where it was empty, (N,)
+            bool; None: it is not recurrent.
+        goes_on: (T, N) bool, the state stays until the next row.
     """
     if "action" not in batch:
         batch = batch.replace(action=action_codec(space).zeros(*batch.lead))

@@ -78,7 +78,7 @@ class Search:
     act as a selector lets them act, because their ends are the states to learn in.
 
     Args:
-        skill: that is to start.
+        skill: the skill that is to start.
         starts: how.
         engine: the environments.
     """

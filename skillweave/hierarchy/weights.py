@@ -163,7 +163,7 @@ def read_weights(
 
     Args:
         roles: as declared.
-        tensors, header: what ``open_weights`` read from ``path``.
+        tensors, header: as ``open_weights`` read them from ``path``.
 
     Raises:
         RunError: the file is damaged, or belongs to other skills or another environment.

@@ -43,7 +43,7 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
 
     Args:
         log: the calls.
-        task: that is planned; None: the numbers are for any.
+        task: the planned task; None: the numbers are for any.
     """
     space = log.observation_space
     codec = obs_codec(space)

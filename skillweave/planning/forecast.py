@@ -73,9 +73,8 @@ class Forecast:
         unsure: the skills that are often called where the log has no call of them near.
         reason: why the chance is small or unknown; empty: it is neither.
         goals: of each of the calls, its goals in words; empty: it has none.
-        already: which words of the mission hold before anything is done; empty: the mission asks
-            for something.
-        episodes: that were played, whose share the chance is; 0: none.
+        already: the words of the mission that hold before anything is done; empty: none does.
+        episodes: the number of played ones, whose share the chance is; 0: none.
     """
 
     calls: tuple[tuple[str, float], ...]
@@ -293,7 +292,7 @@ def played(expected: Forecast, done: int | None, episodes: int, steps: float) ->
     Args:
         expected: before they were played.
         done: the episodes that succeeded; None: the task has no accepting state.
-        episodes: how many were played.
+        episodes: the number that were played.
         steps: their mean steps.
     """
     share = None

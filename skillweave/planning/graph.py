@@ -93,7 +93,7 @@ class CallGraph:
         neighbors: K.
         skills: for initiation sets in observations that are not in the log; None: those that were
             recorded at the ends of calls.
-        task: that will be planned, as far as it is known; see ``compared_places``.
+        task: the task that will be planned, as far as it is known; see ``compared_places``.
 
     Raises:
         RunError: the log has less than two calls.

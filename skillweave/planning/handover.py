@@ -548,7 +548,7 @@ class Blame:
         place: the number of the flat observation that the first skill changes and in which these
             ends differ most; None: there is none, or images.
         means: its mean at the best ends, and at the others.
-        reasons: how the calls that failed ended: own, limit, interrupted, episode.
+        reasons: the ends of the calls that failed: own, limit, interrupted, episode.
         first: True if other ends of the first skill would do, so that it is to blame.
         works: where the second skill is clearly more often done: the skill before ("start": none),
             its calls that are done there, and all.

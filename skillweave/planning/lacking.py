@@ -116,7 +116,7 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
 
 
 def asks_nothing(task: RewardMachine, log: CallColumns) -> str:
-    """Return which words of a task hold before anything is done, in a sentence; empty: it asks.
+    """Return a sentence on words of a task that hold before anything is done; empty: none does.
 
     A task asks for nothing if most logged episodes do it in the fewest steps in which it can be
     done, whatever skill acts. An event that holds in nearly all logged steps asks for nothing

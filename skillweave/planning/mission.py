@@ -110,7 +110,7 @@ class Mission(RewardMachine):
         legs: predicates, functions of observations or of a ``Step``, ``held(...)``,
             ``either(...)``, ``in_any_order(...)``, other missions, or lists of these (sequences).
         avoid: predicates; where one holds before the mission is done, it has failed.
-        repeat: how many times the legs are done; None: again and again, without an end.
+        repeat: the number of times that the legs are done; None: again and again, without an end.
 
     Raises:
         DeclarationError: it has no legs, a leg has a wrong type, or two legs in succession are the

@@ -210,7 +210,7 @@ def nearest(points: Array, to: Array, count: int, group: Array) -> tuple[Array, 
     Args:
         points: (m, F) float32.
         to: (n, F) float32.
-        count: how many.
+        count: the number of points.
         group: (m,) the group of each point; of a group only the nearest point counts.
 
     Returns:

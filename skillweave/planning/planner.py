@@ -289,7 +289,7 @@ class Planner(ReadySelector):
         """Draw logged observations, and states of the task that is not over in them.
 
         Args:
-            count: how many at most.
+            count: the most observations.
             goals: the most goals that they have, where observations hold goals.
             rng: the source of chance.
 

@@ -200,7 +200,7 @@ class CallAndReturn(Choices, RowPolicy):
     Args:
         selector: chooses; None: the caller does, by ``begin``.
         skills: in order.
-        lengths: that are chosen from together with skills; (): none is chosen.
+        lengths: the lengths that are chosen together with skills; (): none is chosen.
         guide: with a ``Selector``: restricts the choices, or only tells what it would choose.
         interruption: when the selector cuts a call; None: never.
         fresh_calls: it is a skill that has goals: selector and guide see them beside observations,

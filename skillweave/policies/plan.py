@@ -151,7 +151,7 @@ class OptionGroup:
         """Return the nearest pieces to features ``to`` (n, F), however far they are.
 
         Args:
-            k: how many, each of another call.
+            k: the number of pieces, each of another call.
             aims: (C, G) float32, the standardised goals of all calls; None: it has no goals.
             without: (n,) calls whose pieces do not count; None: all count.
 

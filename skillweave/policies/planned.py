@@ -294,7 +294,7 @@ class Planned(Rule):
         """Return values (k, O) for which the episode's own calls count as logged ones.
 
         Args:
-            now: what the log says in the present.
+            now: the worth by the log in the present state.
         """
         corrected = now["q"].copy()
         names: tuple[str, ...] = ("choice", "start", "from", "goal")

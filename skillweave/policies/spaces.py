@@ -306,7 +306,7 @@ class Space:
         Args:
             values: (n, *shape); of a Dict or Tuple also dicts and tuples of such arrays.
             who: whose goals they are, for messages.
-            skill: which is given them, for messages.
+            skill: the skill that gets them, for messages.
             rows: the environments (k,) whose goals are returned, (k, *shape); None: all. The goals
                 of the others may be anything.
 

@@ -122,7 +122,7 @@ def _form(x: Any, seen: dict[int, Any], owner: Any = None) -> Any:
     """Return a value as JSON; of what is neither plain nor code, the name of its class.
 
     Args:
-        seen: what was read already; it is read once.
+        seen: the values that were read already; each is read once.
         owner: the object whose method it is.
     """
     match x:

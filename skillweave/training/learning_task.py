@@ -63,7 +63,7 @@ def skill_task(
     """Return the learning task of a skill's stage, or of a plain agent's.
 
     Args:
-        role: who learns.
+        role: the role that learns.
         reflexes: in force while it acts.
         starts: how calls of the skill start; None: wherever it may.
         limit: the most steps of a call; None: the skill's own limit.

@@ -40,7 +40,7 @@ class PlayedCalls:
     where its work is done would succeed each time.
 
     Args:
-        policy: that plays.
+        policy: the policy that plays.
         spaces: of the environments' observations and actions.
         info: keys of ``info`` to record.
         own_rewards, inside, steps, spec: see ``Recorder``.

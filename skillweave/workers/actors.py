@@ -46,7 +46,7 @@ class Actors:
     """The actors of a run, kept from stage to stage; each holds one collector.
 
     Args:
-        count: how many there may be at once; the cluster keeps room for them.
+        count: the most actors at once; the cluster keeps room for them.
         cpus: of each.
         patience: seconds to wait while the cluster has no room for them.
         tell: called with sentences for people.
@@ -138,7 +138,7 @@ class ActorWorker(Worker):
 
     Args:
         actors: where.
-        code: what makes the collector, packed, in the object store.
+        code: the packed function that makes the collector, in the object store.
         each: its environments.
         number: of the worker, and of its actor.
         alone: no answers of other workers are joined with its own.
@@ -215,7 +215,7 @@ def actor_workers(
         make: makes the collector of each.
         each: environments of a worker.
         count: W.
-        name: what messages call the environment.
+        name: the environment's name in messages.
     """
     code = _put(packed(make, f"what collectors of {name} are made of"))
     return [ActorWorker(actors, code, each, i, count == 1) for i in range(count)]

@@ -71,7 +71,7 @@ class Ray:
         """Connect this process to the cluster for a block; yield the module ``ray``.
 
         Args:
-            most: what will run at once.
+            most: the number of workers that will run at once.
 
         Raises:
             MissingExtra: the extra 'ray' is not installed.

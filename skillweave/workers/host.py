@@ -159,7 +159,7 @@ class Workers:
 
     Args:
         workers: W of them, of one kind.
-        name: what messages call the environment.
+        name: the environment's name in messages.
 
     Raises:
         SkillweaveError: a task failed; the kind is the kind of its error.
@@ -270,7 +270,7 @@ class WorkerCollectors(Workers, Collectors):
         workers: W of them.
         each: environments of a worker.
         members: P.
-        name: what messages call the environment.
+        name: the environment's name in messages.
     """
 
     def __init__(self, workers: Sequence[Worker], each: int, members: int, name: str) -> None:

@@ -43,7 +43,7 @@ def packed(thing: Any, who: str) -> bytes:
     What is installed is only named, so it must be installed where this is unpacked.
 
     Args:
-        who: what messages call it.
+        who: its name in messages.
 
     Raises:
         DeclarationError: something in it belongs to this process, such as an open file.

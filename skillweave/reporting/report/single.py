@@ -92,7 +92,7 @@ def write_report(
     """Write a run's report: one HTML file.
 
     Args:
-        policy, spec: what was trained, and on what; None: no episodes are played.
+        policy, spec: the trained policy and its environment; None: no episodes are played.
         why_not: the reason why there is no policy, where the run itself is finished.
         episodes: to play, with seeds that training never used.
         filmed: number of these in the film, from the worst to the best.
