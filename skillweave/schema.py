@@ -93,7 +93,7 @@ def fitted(kind: Any, value: Any, where: str) -> Any:
 
     Args:
         kind: its annotation.
-        value: what was given.
+        value: the given value.
         where: the setting, for messages: ``PPO.gamma``.
 
     Raises:
@@ -113,7 +113,7 @@ def fit(kind: Any, data: Any, file: str, path: str = "") -> Any:
 
     Args:
         kind: what it must be.
-        data: what was read.
+        data: the data that were read.
         file: the file that it is from, for messages; "" if the caller names it.
         path: the field in it: ``stages[0].algorithm``.
 
@@ -394,7 +394,7 @@ def flat(settings: Any, prefix: str = "") -> dict[str, Any]:
 
     Args:
         settings: a dataclass.
-        prefix: what all names begin with.
+        prefix: the start of all names.
     """
     values: dict[str, Any] = {}
     for name in (f.name for f in fields(settings)):

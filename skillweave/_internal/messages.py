@@ -84,10 +84,10 @@ def suggest(
     """Return the end of a sentence about an unknown name: the known one that is probably meant.
 
     Args:
-        name: what was written.
+        name: the name that was written.
         known: the names that exist there.
         elsewhere: by the names that exist at other places, where: "a setting of apart: …".
-        least: how similar a name must be, from 0 to 1, as ``difflib``'s ratio.
+        least: the similarity that a name must have, from 0 to 1, as ``difflib``'s ratio.
         listed: name all that are known where none is similar.
 
     Returns:

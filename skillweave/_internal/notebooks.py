@@ -36,7 +36,7 @@ def table(head: Sequence[object], rows: Iterable[Sequence[object]], left: int = 
 
 
 def facts(rows: Iterable[tuple[str, object]]) -> Markup:
-    """Return a table of two columns: names, and what is so named."""
+    """Return a table of two columns: names and their values."""
     return table((), ((Markup(f"<b>{escape(k)}</b>"), v) for k, v in rows), left=2)
 
 
@@ -46,7 +46,7 @@ def paragraph(text: object) -> Markup:
 
 
 def joined(parts: Iterable[str]) -> str:
-    """Return pieces of HTML as what ``_repr_html_`` returns."""
+    """Join pieces of HTML to a result of ``_repr_html_``."""
     return f"<div>{''.join(parts)}</div>"
 
 

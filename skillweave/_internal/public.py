@@ -74,7 +74,7 @@ HOMES = {
     module: {name: home for home, names in homes.items() for name in names.split()}
     for module, homes in PUBLIC.items()
 }
-"""The same, by module and name."""
+"""Modules that define the public names, by public module and name."""
 
 
 def lazy(module: str) -> tuple[list[str], Callable[[str], Any], Callable[[], Iterable[str]]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from skillweave.errors import DeclarationError
 
 FOLDER = Path(__file__).parents[1] / "recipes"
-"""Where recipes are shipped."""
+"""The folder of the shipped recipes."""
 
 
 def names() -> list[str]:

@@ -291,7 +291,7 @@ class Algorithm:
         return ActingParams(self.acting.views(flat), shift, scale, extra)
 
     def exploration(self, state: Any, progress: float) -> dict[str, Tensor]:
-        """Return what exploration depends on now, such as ε, (P, …) each; by default nothing.
+        """Return the numbers that exploration depends on now, such as ε, (P, …); by default none.
 
         Args:
             state: of P members.

@@ -257,8 +257,8 @@ class Rollout:
     valid: Tensor | None = None  # (P, T, B) bool; None: all
     dist_params: Tensor | None = None  # (P, T, B, H), the distribution that ``action`` is from
     log_std: Tensor | None = None
-    """Of the policy that acted, where it is no part of ``dist_params``: (P, 1, 1, A), or
-    (P, 1, B, A), by column."""
+    """The policy's log standard deviation, where ``dist_params`` does not contain it: (P, 1, 1, A),
+    or (P, 1, B, A), by column."""
     recurrent_state: Tensor | None = None  # (P, B, M), before the first row
     episode_start: Tensor | None = None  # (P, T, B) bool, the recurrent state is empty before
     advantage: Tensor | None = None  # (P, T, B), added to the learner's own advantage

@@ -83,7 +83,7 @@ class OffPolicyAlgorithm(Algorithm):
         Args:
             rate: the learning rate now, (P,).
             noise: from ``learning_noise``.
-            due: whether the slower networks are updated, too.
+            due: the slower networks are updated, too.
 
         Returns:
             Metrics (P,), and the error of each sample (P, B).

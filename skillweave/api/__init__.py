@@ -108,7 +108,7 @@ from skillweave.workers.cluster import Ray
 
 
 class Trainable:
-    """What hierarchies and plain agents have in common."""
+    """The methods that hierarchies and plain agents have in common."""
 
     def __repr__(self: Any) -> str:
         return declared_line(self)
@@ -356,8 +356,9 @@ class Hierarchy(Trainable, Declaration):
     """Words for missions as texts (``Run.plan``): functions of observations or of a ``Step``, by
     name. The name of each skill is such a word already: its ``success``."""
     features: Any = None
-    """By what plans compare observations, as for ``planning.Planner``: a function of observations
-    (n, …) to numbers (n, F), or a dict of these by skill. Skills that see images need it."""
+    """Numbers by which plans compare observations, as for ``planning.Planner``: a function of
+    observations (n, …) to numbers (n, F), or a dict of these by skill. Skills that see images
+    need it."""
     name: str = "hierarchy"
     """Its name where it is a skill of another hierarchy."""
 
@@ -584,7 +585,7 @@ class TrainedPolicy:
         info: Sequence[str] = (),
         quiet: bool = False,
     ) -> Evaluation:
-        """Score it in whole episodes.
+        """Score the policy in whole episodes.
 
         Args:
             episodes: whole episodes.
@@ -922,7 +923,7 @@ class TrainedPolicy:
         return self.hierarchy.spec
 
     def _check_written(self) -> None:
-        """Raise a RunError where this is not what is written under ``path``."""
+        """Raise a RunError where the policy is a planned one, which the run's files do not hold."""
 
     def _check_logged(self) -> None:
         """Raise a DeclarationError where evaluations do not show whole calls."""
@@ -946,6 +947,7 @@ class TrainedPolicy:
         return self.policy if skill is None else self._alone(skill)
 
     def _alone(self, skill: str) -> SkillAlone:
+        """Return the policy of one skill of the hierarchy, which acts alone."""
         if not isinstance(self.policy, HierarchyPolicy):
             raise DeclarationError("this is a plain agent: it has no skills")
         self.hierarchy.skill(skill)
@@ -1228,7 +1230,7 @@ def info_json(
 
 
 def run_of(trained: Trained[Hierarchy | Agent]) -> Run:
-    """Return what training or loading made as a ``Run``."""
+    """Return a trained or loaded declaration and its policy as a ``Run``."""
     declared, run, policy = trained
     if run.manifest.hierarchy is None and isinstance(declared, Hierarchy):
         declared = declared.plain_agent()  # the flat baseline
@@ -1248,6 +1250,7 @@ def _labels_of(
     colors = {path: color_of(i, s.color) for i, (path, s) in enumerate(skills.items())}
 
     def label(memory: Memory) -> tuple[str, RGB, str]:
+        """Return the acting skill's path, colour and goal, by the policy's memory."""
         if roles is None:
             return AGENT, color_of(0, None), ""
         acting = policy.policy if isinstance(policy, SkillAlone) else policy

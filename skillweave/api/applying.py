@@ -75,6 +75,7 @@ def _recorded_roles(roles: Roles, run: RunDirectory) -> Roles:
     entries, levels = run.manifest.by_path, run.manifest.levels
 
     def recorded(level: Level) -> Level:
+        """Return a level with the settings and limits of its entry in the run."""
         entry = levels[level.path]
         where = f"{run.path}: {level.path}" if level.path else str(run.path)
         check_guided(level.guide is not None, entry.guide is not None, where)
@@ -108,7 +109,7 @@ def _notice_limits(now: Roles, then: Roles, run: RunDirectory) -> None:
 
 
 def _limited(skill: Skill, entry: SkillEntry) -> Skill:
-    """Return a copy of a skill with the limits of its calls that a run records."""
+    """Return a copy of a declared skill with the limits of its calls that a run records."""
     limited = copy.copy(skill)
     for field in ("max_steps", "call_steps"):
         if getattr(skill, field) != getattr(entry, field):

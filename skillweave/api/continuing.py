@@ -20,7 +20,7 @@ EVALUATIONS = "evaluation*.json"
 
 
 def continuable_run(path: Path) -> RunDirectory | None:
-    """Return the run in a directory, if there is something to continue."""
+    """Return the run in a directory; None: there is none, or it has learnt nothing so far."""
     if not (path / "run.json").exists():
         return None
     run = RunDirectory.open(path)
@@ -70,7 +70,7 @@ def continue_run(
 
 
 def _check_same(content: Manifest, run: RunDirectory) -> None:
-    """Raise a RunError where a run is of another kind, recipe or seed than ``content``."""
+    """Raise a RunError where a run is of another kind, recipe or seed than a manifest."""
     manifest = run.manifest
     if content.kind != manifest.kind:
         flat = "--flat" if from_command_line() else "flat=True"

@@ -81,11 +81,12 @@ class Player(Actor):
         super().reset()
 
     def _begin(self, seen: Array) -> None:
-        """Set the goal of a skill with goals that acts alone."""
+        """Set the goal of a new episode, if a skill with goals acts alone."""
         if isinstance(self.policy, SkillAlone):
             self.policy.choose_goals(self.memory, ROW, seen, [self._world.rng])
 
     def _with_goal(self, policy: Policy, goal: Any) -> Policy:
+        """Return the player's policy with one goal in all episodes; None: as it is."""
         if goal is None:
             return policy
         if isinstance(policy, SkillAlone):

@@ -121,7 +121,7 @@ def read_recipe_file(path: Path, recipe: str, *, shipped: bool = False) -> Modul
 
 
 def _sentence(error: BaseException, recipe: str) -> str:
-    """Return what went wrong while a recipe's file ran."""
+    """Return the sentence that reports an error in a recipe's file."""
     if isinstance(error, SystemExit):
         return (
             f"{recipe} ends Python while it is read ({place(error)}). Put what is to run only as a "
@@ -145,7 +145,7 @@ def _free_name(path: Path) -> str:
 
 
 def _check_names(path: Path, recipe: str) -> None:
-    """Raise a DeclarationError where a file beside a recipe would not be what it imports.
+    """Raise a DeclarationError where another module hides a file that a recipe imports.
 
     Python keeps one module of each name. Without this check, a recipe could get the file of another
     recipe, or a package, in silence.
@@ -185,7 +185,7 @@ def _beside(path: Path) -> dict[str, Path]:
 
 
 def imported(source: bytes, package: str = "") -> Iterator[str]:
-    """Yield the modules that a file of a package names, and the packages that they are in."""
+    """Yield the modules that the source of a recipe's file imports, with their packages."""
     for node in ast.walk(ast.parse(source)):
         names: list[str] = []
         if isinstance(node, ast.Import):

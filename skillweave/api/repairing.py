@@ -142,7 +142,7 @@ def _resume_repair(declared: D, skill: str, after: str, options: RepairOptions) 
 
 
 def _checked(roles: Roles, skill: Any, after: Any) -> tuple[str, str]:
-    """Return the paths of both skills.
+    """Check the two skills of a repair, and return their paths.
 
     Raises:
         DeclarationError: the first one cannot learn, or may not follow the other one.
@@ -188,7 +188,7 @@ def _measured(
     num_envs: int,
     progress: Progress,
 ) -> Measured:
-    """Measure the handover as it is.
+    """Measure the handover of a pair of skills before their repair.
 
     Raises:
         DeclarationError: there is nothing to repair, or the skill may not start there, or images
@@ -225,7 +225,7 @@ def _measured(
 
 
 def _stage_name(skill: str, taken: set[str]) -> str:
-    """Return a name of a stage that no other one has."""
+    """Return a name for the stage of a repair; no other stage of the run has it."""
     name = f"{skill}-repair"
     number = 2
     while name in taken:
@@ -241,7 +241,7 @@ Policies = dict[str, dict[str, AgentPolicy]]
 def _content(
     declared: Declaration, source: Path, roles: Roles, policy: HierarchyPolicy
 ) -> tuple[Manifest, Policies]:
-    """Return a manifest with entries of finished stages, and their policies."""
+    """Return the manifest of a repair's new run, with finished stages, and their policies."""
     policies: Policies = {}
     if source.is_dir():
         run = RunDirectory.open(source)

@@ -46,7 +46,7 @@ class RunCalls:
             info: keys; those of earlier calls are added, so that all calls can be joined.
 
         Raises:
-            RunError: what is recorded could not be kept, or the skills' code is missing, which the
+            RunError: recorded calls could not be kept, or the skills' code is missing, which the
                 calls so far were recorded with.
         """
         if self._is_own():
@@ -99,7 +99,7 @@ class RunCalls:
         return self._with_memory(load_calls(RunDirectory.open(self._path)) if is_run else None)
 
     def _with_memory(self, log: CallLog | None) -> CallLog | None:
-        """Return the calls of a file with those that are not in it."""
+        """Return the calls in the run's file, joined with those that are only in memory."""
         if log is None or self._memory is None:
             return self._memory if log is None else log
         return joined(log, self._memory)

@@ -60,7 +60,7 @@ def _may_train() -> None:
 
 
 def train(declared: D, options: TrainOptions) -> Trained[D]:
-    """Check everything, start a run, or continue the one that is there, and train it."""
+    """Check a declaration, start a run or continue the one that is there, and train it."""
     declared.validate()
     flat = options.flat
     note = ""
@@ -85,7 +85,7 @@ def start_run(
     repair: First | None = None,
     done: Mapping[str, Any] | None = None,
 ) -> Trained[D]:
-    """Check everything, start a run, or continue the one that is there, and train it.
+    """Start the run of a manifest, or continue the one in its directory, and train it.
 
     Args:
         content: the manifest of a new run, without options of this training alone.
@@ -172,7 +172,7 @@ def existing_run(declared: Declaration, content: Manifest, run_dir: Path) -> Run
 
 @global_generators(Seeds(0) / "plan")  # environments are made, and timed
 def _plan(declared: Declared, content: Manifest, options: TrainOptions) -> Mapping[str, Role]:
-    """Check everything, and complete the entries of a manifest's stages; return the roles."""
+    """Check a training's arguments, and complete its manifest's stages; return the roles."""
     stages = [stage for stage in content.stages if not stage.done]
     spec, cluster = declared.spec, options.cluster
     declared.check_spaces()

@@ -34,17 +34,17 @@ from skillweave.training.role import Role
 
 
 class InDirectory(Protocol):
-    """A ``Run``."""
+    """An object with the path of a run's directory, such as ``Run``."""
 
     path: Path
     """Its directory."""
 
 
 Origin = str | Path | InDirectory | Learnable | Learnt
-"""What a learner starts from: a run, its directory, or a policy made elsewhere
+"""The source of a learner's first weights: a run, its directory, or a policy made elsewhere
 (``from_sb3(..., learn=True)``)."""
 StartFrom = Origin | Mapping[str, Origin] | None
-"""What to start from: that of all learners of these names, or one by learner."""
+"""The argument ``start_from``: one origin for all learners of the same names, or one by learner."""
 
 
 def starts(
@@ -141,7 +141,7 @@ def _config_in(stage: StageEntry, name: str) -> Any:
 
 
 def _place(run: Any, argument: str) -> Path:
-    """Return the directory of a run.
+    """Return the directory of the run in the argument ``start_from``.
 
     Raises:
         DeclarationError: it is a policy, or a file with one; the message names its use.
@@ -156,7 +156,7 @@ def _place(run: Any, argument: str) -> Path:
 
 
 def _use_of(value: Any) -> tuple[str, str] | None:
-    """Return words on a policy from elsewhere, and on its use; None for other values."""
+    """Return words on a policy from elsewhere and on its use, for errors; None: it is none."""
 
     def as_skill(policy: str) -> str:
         return (

@@ -51,7 +51,7 @@ class OwnPolicy(Functional):
         part: OwnPart | None = None,
     ) -> None:
         def seen(obs: Array) -> Array:
-            """Return what the policy sees of observations that hold the task's state."""
+            """Return the skill's own observations, without the state of the task."""
             own = view.obs(obs)
             return own if part is None else part.part.see(own)
 
@@ -78,15 +78,15 @@ class ViewedSelector(Viewed, Selector):
         self.ends_matter = self.policy.ends_matter
 
     def chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
-        """Return how likely the selector's choices are, see ``Selector``."""
+        """Return the probabilities of the selector's choices; see ``Selector``."""
         return self.policy.chances(memory, rows, self.view(obs), may)
 
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
-        """Return which choices the selector leaves, see ``Selector``."""
+        """Return the choices that the selector leaves; see ``Selector``."""
         return self.policy.ahead(memory, rows, may)
 
     def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
-        """Show the selector what it sees of a step, and how the last calls ended."""
+        """Pass the selector its own view of a step, and how the last calls ended."""
         self.policy.watch(memory, rows, self.seen(step), last)
 
 
@@ -161,6 +161,7 @@ def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillS
 def _own_hierarchy(
     policy: HierarchyPolicy, view: OwnView, space: gym.Space[Any]
 ) -> HierarchyPolicy:
+    """Return a hierarchy that sees the environment's own observations, at all levels."""
     selector: Any = policy.selector
     spaces = space, selector.action_space
     if isinstance(selector, ReadySelector):

@@ -16,7 +16,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 Out = Annotated[Path, arg(aliases=["-o"])]
 """A place to write to."""
 MaybeOut = Annotated[Path | None, arg(aliases=["-o"])]
-"""The same; None: a default place."""
+"""A place to write to; None: a default place."""
 Words = UseAppendAction[tuple[str, ...]]
 """Words of an option that may be given several times."""
 Runs = Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(one or more)")]
@@ -212,7 +212,7 @@ class LogCommand(Coded, OfRun):
     info: Words = ()
     """Record this key of the environment's info, too, for tasks that read it."""
     seed: int | None = None
-    """Of the environments and the choices; default: one that the run's log does not have."""
+    """Seed of the environments and the choices; default: one that the run's log does not have."""
 
 
 @dataclass(frozen=True)
@@ -244,18 +244,18 @@ class PlotCommand(Output):
     runs: Runs = tyro.MISSING
     """Runs or sweeps. Of several, those that differ by their seed alone are one line."""
     out: MaybeOut = None
-    """Of one run a directory; default: plots, in the run. Of several the files, without suffix;
-    default: curves."""
+    """Directory of the plots of one run (default: plots, in the run), or, of several runs, the
+    files without their suffix (default: curves)."""
     metric: str | None = None
-    """Of several runs: what to draw; default: eval_return where all have it, else return."""
+    """Metric to draw of several runs; default: eval_return where all have it, else return."""
     agent: str | None = None
-    """Of several runs: a skill, or selector; default: the whole policy."""
+    """Skill or selector to draw of several runs; default: the whole policy."""
     band: Literal["iqr", "range", "none"] = "iqr"
-    """Of several runs: from the 25th to the 75th percentile of the seeds, or lowest to highest."""
+    """Band around a line of several seeds: 25th to 75th percentile, lowest to highest, or none."""
     label: Words = ()
-    """Of several runs: the name of a line, once for each, in their order."""
+    """Name of a line in the figure of several runs, once for each line, in their order."""
     width: float = 3.3
-    """Of several runs: inches; a column of a paper has 3.3."""
+    """Width of the figure of several runs in inches; a column of a paper has 3.3."""
 
 
 @dataclass(frozen=True)
@@ -267,7 +267,7 @@ class ReportCommand(OfEpisodes, Coded, OfRun):
     episodes: int = 20
     """Episodes to play, with seeds that training never used."""
     films: int = 3
-    """How many of them to film, from the worst to the best; 0: no film."""
+    """Number of these episodes to film, from the worst to the best; 0: no film."""
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ def foreign_words(words: Sequence[str], commands: Mapping[str, type]) -> str:
 
 
 def _way(option: str, trains: bool) -> str | None:
-    """Return what to write for an option of another tool; None: it is unknown.
+    """Return advice in place of another tool's option; None: the option is unknown.
 
     Args:
         option: without dashes before it.

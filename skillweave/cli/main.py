@@ -27,7 +27,7 @@ from skillweave.policies.acting_errors import RunError
 Put = Callable[[str], None]
 """A function that writes a command's result."""
 ADDRESS = re.compile(r"auto|local|(ray://)?[^\s/-][^\s/]*:\S*")
-"""What may follow ``--ray``."""
+"""Addresses of a cluster that may follow ``--ray``."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

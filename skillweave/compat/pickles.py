@@ -138,7 +138,7 @@ def check_sizes(file: zipfile.ZipFile, size: int, program: str) -> None:
 
 
 class _Weight:
-    """What is known of an object of a pickle before it is made."""
+    """The size and depth of a pickle's object, which are known before it is made."""
 
     def __init__(self) -> None:
         self.depth = 0

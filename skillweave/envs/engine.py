@@ -123,7 +123,7 @@ class Engine(Protocol):
 
 
 class WatchedEngine:
-    """What engines have in common: what comes back is checked, and what is done is kept.
+    """A base class of engines: it checks the environments' results, and records their actions.
 
     Args:
         env: one of the environments, for its spaces and its time limit.

@@ -184,7 +184,7 @@ def _carried(
     change: Change,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
-    """Return a family's fields in the new layout."""
+    """Return a parameter group's weights and moments in the layout of the changed network."""
     names = (*before.weights, *before.moments, before.count)
     lead = state[names[0]].shape[:-1]
     # New parameters begin with moments of 0 after 0 steps; the others keep theirs.
@@ -202,7 +202,7 @@ def _carried(
 
 
 def _parts_of(net: Any, change: Change) -> Sequence[Units | Joint | str]:
-    """Return what changes in a network, one after another: units, the last layer, or filters."""
+    """Return the parts of a network that a mutation changes: units, the last layer, or filters."""
     if change.kind == "layer":
         joint = joint_of(net)
         return [joint] * (change.by > 0 or joint.depth > 1)

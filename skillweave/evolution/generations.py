@@ -125,7 +125,7 @@ class EvolvingPopulation:
 
     @property
     def over(self) -> bool:
-        """Return whether all generations are complete, or the stage ends before.
+        """Return whether all generations are complete, or the stage ends early.
 
         It ends when the target is reached, the budget is spent, or a callback requests it.
         """
@@ -135,7 +135,7 @@ class EvolvingPopulation:
 
     @property
     def _good(self) -> bool:
-        """Return whether the target is reached."""
+        """Return whether the stage's target is reached."""
         target = self.entry.target
         best = self.best
         return target is not None and best is not None and best.fitness >= target.at_least
@@ -190,7 +190,7 @@ class EvolvingPopulation:
         return self.best.policy
 
     def _until(self, spent: int) -> tuple[int, int]:
-        """Return the steps of each member at this generation's end, and the end of schedules.
+        """Return the steps of each member at the generation's end, and at the end of schedules.
 
         The budget includes fitness measurements, which are assumed to take as many steps as the
         last one.

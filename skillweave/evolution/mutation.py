@@ -80,6 +80,7 @@ def random_config(
 
 
 def _random_network(network: Network, by: Mutations, rng: np.random.Generator) -> Network:
+    """Draw a network's architecture and activation from the ranges of mutations."""
     if by.architecture > 0.0:
         depth = int(rng.integers(by.layers[0], by.layers[1] + 1))
         low, high = by.units

@@ -65,6 +65,7 @@ def select(evolution: Evolution, fitness: Array, rng: np.random.Generator) -> li
 
 
 def _tournament(by: Tournament, fitness: Array, rng: np.random.Generator) -> list[Heir]:
+    """Select heirs: each parent is the best of a few members drawn at random."""
     able = np.flatnonzero(np.isfinite(fitness))
     heirs = [Heir(int(fitness.argmax()), False)] if by.elitism else []
     while len(heirs) < len(fitness):
@@ -74,6 +75,7 @@ def _tournament(by: Tournament, fitness: Array, rng: np.random.Generator) -> lis
 
 
 def _truncation(by: Truncation, fitness: Array, rng: np.random.Generator) -> list[Heir]:
+    """Select heirs: the worst members are replaced by heirs of the best."""
     order = np.argsort(-fitness, kind="stable")
     count = max(1, round(by.share * len(fitness)))
     able = order[: min(count, int(np.isfinite(fitness).sum()))]

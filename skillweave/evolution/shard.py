@@ -158,7 +158,7 @@ class Shard:
         return Stack(algorithm, state_to(state, resolve_device(algorithm.config.device)))
 
     def _together(self, places: Sequence[Collector], stacks: Sequence[Stack]) -> Collector:
-        """Return the places as one collector, in which the stacks act."""
+        """Return the places' collectors as one, in which the stacks act."""
         engine: Any = JoinedEngines([place.engine for place in places])
         acting = Acting([(s.algorithm, s.members) for s in stacks], engine.num_envs)
         return joined_from(places, engine, acting)
@@ -244,7 +244,7 @@ def policy_of(member: Member, spaces: tuple[Any, Any]) -> AgentPolicy:
 
 
 def has_diverged(member: Member) -> bool:
-    """Return whether a learnt number is not finite."""
+    """Return whether a member has diverged: a number that it learnt is not finite."""
     return not all(bool(torch.isfinite(v).all()) for v in vars(member.state).values())
 
 

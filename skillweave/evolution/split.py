@@ -1,6 +1,6 @@
 """A population in several parts, each at a worker: a process, or an actor of Ray.
 
-A part is a ``Part``: its places stay at its worker, members are sent there and back in each
+A part is a ``Shard``: its places stay at its worker, members are sent there and back in each
 generation. Results depend on the number of parts, but not on their workers.
 """
 
@@ -32,16 +32,16 @@ Sent = tuple[int, dict[str, Any], int, dict[str, Array]]
 
 
 Task = tuple[list[Sent], int, int, Seeds]
-"""The members that train at a part, and the next three arguments of ``Part.train``."""
+"""The members that train at a part, and the next three arguments of ``Shard.train``."""
 Ticks = list[tuple[int, dict[str, float]]]
 
 
 class Parts:
-    """Several parts with the interface of one.
+    """Shards of a population at workers, with the interface of one ``Shard``.
 
     Args:
         make_workers: creates their workers.
-        learning_task, config, seeds: see ``Part``.
+        learning_task, config, seeds: see ``Shard``.
         count: the number of places.
         parts: the number of parts; their sizes differ by at most one.
         episodes: episodes whose mean return is a member's fitness.
@@ -95,7 +95,7 @@ class Parts:
                 member.steps = steps
 
     def fitness(self, members: Sequence[Member], eval_envs: FitnessEnvs, seeds: Seeds) -> Array:
-        """Return fitness as ``Part.fitness`` does, each part in its own environments."""
+        """Return fitness as ``Shard.fitness`` does, each part in its own environments."""
         tasks = [(_sent(group), seeds) for group in self._divided(members)]
         results = self._workers.ask("fitness", tasks, kept=False)
         self.steps_elsewhere += sum(steps for _, steps in results)
@@ -125,7 +125,7 @@ class Parts:
 
 
 class PartHost:
-    """A part of a population at its worker; arguments and results are plain data."""
+    """The shard of a population at a worker; arguments and results are plain data."""
 
     def __init__(self, part: Shard, eval_envs: FitnessEnvs) -> None:
         self._part = part
@@ -147,7 +147,7 @@ class PartHost:
         return fitness, self._eval_envs.steps_made - before
 
     def state(self) -> dict[str, Array]:
-        """Return the state for ``restore``."""
+        """Return the shard's state, for ``restore``."""
         return {k: v.numpy() for k, v in self._part.state().items()}
 
     def restore(self, state: dict[str, Array]) -> Array:
@@ -169,6 +169,7 @@ def _make_host(
     each: int,
     number: int,
 ) -> PartHost:
+    """Return the host of a worker's shard, in a process whose generators are seeded."""
     seed_global_generators(seeds / "global" / number)
     first = bounds[number]
     end = bounds[number + 1]
@@ -188,6 +189,7 @@ def _sent(members: Sequence[Member]) -> list[Sent]:
 
 
 def _received(members: Sequence[Sent], spaces: tuple[Any, Any]) -> list[Member]:
+    """Return the members that a worker was sent."""
     received = []
     for number, settings, steps, state in members:
         config = config_from_json(settings)

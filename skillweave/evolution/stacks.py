@@ -50,7 +50,7 @@ def networks_of(config: AlgorithmConfig) -> dict[str, Network]:
 
 
 def copy(member: Member) -> Member:
-    """Copy a member and its tensors."""
+    """Copy a member of a population with its tensors."""
     state = {k: v.clone() for k, v in vars(member.state).items()}
     return replace(member, state=type(member.state)(**state))
 

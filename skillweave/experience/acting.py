@@ -18,7 +18,7 @@ from skillweave.types import Array
 
 @dataclass(frozen=True)
 class ActionRepeat:
-    """While one lasts, an environment takes one random action again and again.
+    """Repetition of one random action over several steps in an environment (εz-greedy).
 
     Time is cut into spans of ``longest`` rows. In each, every environment has a chance of a
     repetition, which is as long as the span or shorter, and lies somewhere in it. The place of each
@@ -79,7 +79,7 @@ class _Span:
 
 
 class Acting:
-    """P members act in N = P·B environments; member 0 in the first B, and so on.
+    """Acting learners: P members in N = P·B environments; member 0 in the first B, and so on.
 
     Args:
         stacks: each an algorithm and its number of members.
@@ -98,7 +98,7 @@ class Acting:
         self._span: _Span | None = None
 
     def begin(self, request: Request, every_step: bool = True) -> None:
-        """Act by this request from now on.
+        """Load the parameters of a request, by which the members act from now on.
 
         Args:
             every_step: all act in each of its steps, so what they need of chance is drawn at once.
@@ -117,7 +117,7 @@ class Acting:
     def _hold_actions(
         self, action: Array, action_repeat: ActionRepeat, row: int, mask: Array | None
     ) -> None:
-        """Replace what environments do (N, …) that repeat an action, in place."""
+        """Replace the actions (N, …) of environments that repeat a random one, in place."""
         span, place = divmod(row, action_repeat.longest)
         if self._span is None or self._span.key != (action_repeat.seeds, span):
             self._span = self._drawn(action_repeat, span)
@@ -149,7 +149,7 @@ class Acting:
 
     @torch.inference_mode()
     def some(self, rows: Array, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
-        """Act in environments ``rows`` (n,); all arguments are of these."""
+        """Return the members' actions in environments ``rows`` (n,); all arguments are of these."""
         if self.members == 1 and not self._every:
             return self._act(lambda stack: self._draw(stack, len(obs)), obs, mask, memory)
 
@@ -178,7 +178,7 @@ class Acting:
         return self.stacks[stack][0].noise(self._generators[stack], 1, each)[0]
 
     def _act(self, noise: Any, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
-        """Act stack by stack, in equal numbers of rows of each member."""
+        """Return the actions of all members, stack by stack, in as many rows of each member."""
         found = []
         first = 0
         each = len(obs) // self.members
@@ -197,6 +197,7 @@ class Acting:
     def _stack(
         self, stack: int, noise: Any, obs: Any, mask: Array | None, memory: Array | None
     ) -> Acted:
+        """Return the actions of one stack's members, by its algorithm."""
         algorithm, count = self.stacks[stack]
         allowed = None if mask is None else by_member(mask, count)
         if self._request.at_random:
@@ -221,13 +222,13 @@ class Acting:
 
 
 def by_member(rows: Array, members: int) -> Tensor:
-    """Rows of environments (P·B, …) to (P, B, …), member 0's first."""
+    """Split rows of environments by member: (P·B, …) to (P, B, …), member 0's first."""
     tensor = to_tensor(rows)
     return tensor.view(members, -1, *tensor.shape[1:])
 
 
 def _rows(x: Tensor) -> Array:
-    """(P, B, …) to (P·B, …)."""
+    """Join rows of members to rows of environments: (P, B, …) to (P·B, …)."""
     rows: Array = x.flatten(0, 1).numpy()
     return rows
 

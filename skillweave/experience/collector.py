@@ -46,7 +46,7 @@ PLAYED = 64
 
 @dataclass
 class Collected:
-    """The answer to a request: what learners learn from, and numbers for people."""
+    """Result of a request: the rows of each learner, and statistics of episodes for reports."""
 
     batches: dict[str, Batch]
     """By path, what each learner did; \"\" where there is one."""
@@ -65,7 +65,9 @@ class Collected:
 
 
 class Collector:
-    """N environments, and who acts in them. A function of requests, seeds and ``state``.
+    """A collector: it steps N environments with a policy, and returns each learner's rows.
+
+    Equal requests, seeds and ``state`` give equal rows.
 
     A skill that has goals gets one where a call of it starts, by ``Skill.goals``, until it ends.
     A checkpoint ends no episode: ``state`` holds what is needed to play the open ones again.
@@ -74,8 +76,8 @@ class Collector:
         engine: the environments; they are reset by ``start``, or stand where ``restore`` puts them.
         acting: the plain agent, the skill, or the selectors that learn; None: the guide decides, or
             only ``like`` is to act.
-        who: acts.
-        learners: by path, all others who learn: ``skill``, ``inner/skill``, ``inner/selector``;
+        who: the policies that act.
+        learners: by path, all others that learn: ``skill``, ``inner/skill``, ``inner/selector``;
             ``skill_critic`` and ``inner/skill_critic`` say what skills are worth. None: one alone
             learns, at the path ""; else a selector has the path ``selector``.
         margins: by the paths of critics: calls end where a new decision is worth this much more.
@@ -99,11 +101,11 @@ class Collector:
         self._together = learners is not None
         self._goals = goals_of(self.skill)
         self.obs: Array = np.empty(0)
-        """(N, *obs_shape), what to act on next."""
+        """(N, *obs_shape), the observations to act on next."""
         self.open: dict[str, Array] = {}
-        """What is kept of open calls, (N, …) each, whose shape is known when one begins."""
+        """Numbers of open calls, (N, …) each, whose shape is known only when a call starts."""
         self.search: Search | None = None
-        """What leads to where a skill may start; None: it starts wherever episodes do."""
+        """The search for a start of the skill; None: it starts wherever episodes do."""
         self.limit = None if self.skill is None else self.skill.max_steps
         """The most steps of a call of the skill; None: any number."""
         self.learning: OneLearner | LevelLearners
@@ -120,7 +122,7 @@ class Collector:
             **flat(self.memory, "player."),
             **self.learning.kept,
         }
-        """What is kept of each environment, (N, …) each; changed in place."""
+        """State of each environment between requests, (N, …) each; changed in place."""
         self.values = prefixed("player", self.policy.values()) | self.learning.values
         """By names of these, what numbers that choose among something may be, or whose goals."""
         self.after_request = {"sums", *self.learning.kept}
@@ -149,7 +151,7 @@ class Collector:
         """Keys of ``info`` in the log of calls; None: none is kept."""
         self._info_keys: set[str] = set()
         self._ended: list[tuple[int, Array, Array]] = []
-        """Of episodes that ended in a request: row, environments, and numbers without sums."""
+        """Episodes that ended in a request: row, environments, and numbers without sums."""
 
     def like(self, engine: Engine, acting: Acting) -> Collector:
         """Return a collector of the same kind over other environments."""
@@ -159,7 +161,7 @@ class Collector:
 
     @property
     def elapsed(self) -> Array:
-        """(N,) steps of the calls of the skill that acts, or of the episodes."""
+        """Return the steps (N,) of the calls of the skill that acts, or of the episodes."""
         return self.kept["age" if self.search is None else "elapsed"]
 
     def start(self, seeds: Seeds) -> None:
@@ -171,7 +173,7 @@ class Collector:
             self.begun = True
 
     def collect(self, request: Request) -> Collected:
-        """``request.rows`` steps of each environment."""
+        """Step each environment ``request.rows`` times, and return each learner's rows."""
         before = self.engine.steps_made
         self._info_keys = set()
         self._ended = []
@@ -199,7 +201,7 @@ class Collector:
         """Play one episode in each environment, from its start.
 
         Args:
-            request: who acts; ``rows`` does not count.
+            request: the parameters to act by; ``rows`` does not count.
             max_steps: steps after which an episode is cut.
 
         Returns:
@@ -228,7 +230,7 @@ class Collector:
         return found
 
     def state(self) -> dict[str, Array]:
-        """Return what ``restore`` needs. It changes nothing."""
+        """Return the open episodes and calls, for ``restore``; nothing changes."""
         kept = {k: as_numbers(v).copy() for k, v in self.kept.items()}
         kept["obs"] = checksums(self.obs)
         opened = {k: v.copy() for k, v in self.open.items()}
@@ -275,7 +277,7 @@ class Collector:
         return self._begin_anew(ids)
 
     def finish(self, _: None = None) -> None:
-        """Check at the end of training what it has left in the environments."""
+        """Check at the end of training that it has left nothing in the environments."""
         self.engine.finish()
 
     def close(self) -> None:
@@ -285,7 +287,7 @@ class Collector:
     # Steps are made -----------------------------------------------------------------------------
 
     def _prepare(self, request: Request) -> None:
-        """Act by this request from now on."""
+        """Load the parameters and seeds of a request, by which the collector acts from now on."""
         self.learning.begin(request, self.elapsed)
         self._greedy = request.greedy
         self._goal_rng = (request.seeds / "goals").numpy()
@@ -294,7 +296,7 @@ class Collector:
         self._world = World(rng, self.kept["age"], last, self.overridden)
 
     def _writer(self, rows: int) -> TraceWriter:
-        """Return what writes the trace of ``rows`` steps."""
+        """Return a writer for the trace of the next ``rows`` steps."""
         skill = self.skill
         reads = skill is not None and any(map(skill.defines, skill.methods))
         reads |= self.learning.reads_infos()
@@ -305,7 +307,7 @@ class Collector:
         return writer
 
     def _step(self, out: TraceWriter) -> None:
-        """Step every environment, and write what happened."""
+        """Step every environment, and write the step into the trace."""
         obs = self.obs
         mask = self.engine.mask()
         rows = self._all
@@ -368,7 +370,7 @@ class Collector:
         return action
 
     def _begun(self, end: Array, over: Array, waiting: Array, step: Step) -> Array:
-        """Let new calls begin in episodes that go on, and the search go on where it has to.
+        """Start new calls in episodes that go on, and continue the search for a start.
 
         Args:
             end: (N,), why calls ended.
@@ -388,7 +390,7 @@ class Collector:
         return np.union1d(np.setdiff1d(over, again), lost)
 
     def _goal(self, rows: Array) -> Array | None:
-        """Return the goals of all environments, (N, *goal_shape), after those of new calls.
+        """Return the goals of calls in all environments, (N, *goal_shape); new calls draw theirs.
 
         Args:
             rows: (k,) environments in which the skill acts.
@@ -437,7 +439,7 @@ class Collector:
     # They are judged ----------------------------------------------------------------------------
 
     def _judge(self, trace: Trace) -> tuple[Batch, list[tuple[int, Array, Array]]]:
-        """Judge the steps of a trace.
+        """Judge the steps of a trace by the acting skill, or by the task.
 
         Returns:
             The steps as those who act are judged by them, and the episodes that ended in them:
@@ -458,7 +460,7 @@ class Collector:
         return steps, found
 
     def _views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
-        """Return what each learner did, by path; ``steps`` are those of ``_judge``."""
+        """Return the rows of each learner, by path; ``steps`` are those of ``_judge``."""
         return self.learning.views(trace, steps)
 
     def _count(self, each: Array) -> list[tuple[int, Array, Array]]:
@@ -478,14 +480,14 @@ class Collector:
         return found
 
     def _forget(self, ids: Array) -> None:
-        """Episodes of environments ``ids`` (k,) have just begun."""
+        """Clear the memory of environments ``ids`` (k,), whose episodes have just started."""
         self.kept["age"][ids] = 0
         if self._last_actions is not None:
             self.kept["last_action"][ids] = self._last_actions.start(len(ids))
         self._begin_call(ids, episodes=True)
 
     def _begin_call(self, ids: Array, *, episodes: bool) -> None:
-        """Let a new call begin in environments ``ids`` (k,), perhaps a new episode."""
+        """Start a new call in environments ``ids`` (k,), perhaps a new episode."""
         restart(self.policy, self.memory, ids)
         if self._goals is not None:
             self.kept["needs_goal"][ids] = True
@@ -493,11 +495,12 @@ class Collector:
             self.search.begin(ids, self.obs, episodes=episodes)
 
     def _clear(self, ids: Array) -> None:
-        """Nothing of environments ``ids`` (k,) is left of the requests before."""
+        """Clear the numbers that requests keep of environments ``ids`` (k,), which were reset."""
         for name in self.after_request:
             self.kept[name][ids] = 0
 
     def _begin_anew(self, ids: Array) -> Array:
+        """Reset environments ``ids`` (k,) and clear their memory; return them."""
         if len(ids):
             self.obs = self.obs.copy()
             self.obs[ids] = self.engine.reset_some(ids)
@@ -505,7 +508,7 @@ class Collector:
         return ids
 
     def _tell(self, row: int, ids: Array, info: Mapping[str, Any]) -> None:
-        """Keep the numbers of the episodes of environments ``ids`` (k,), which are over.
+        """Record the episodes that have ended in environments ``ids`` (k,), for reports.
 
         Args:
             row: of the step.
@@ -537,7 +540,7 @@ def as_numbers(x: Array) -> Array:
 
 
 def _checksum(state: Mapping[str, Array]) -> int:
-    """Return a number that follows from all arrays of a state."""
+    """Return one checksum of all arrays of a collector's state."""
     found = 0
     for array in state.values():
         found = zlib.crc32(array.tobytes(), found)
@@ -545,7 +548,7 @@ def _checksum(state: Mapping[str, Array]) -> int:
 
 
 def joined_from(collectors: Sequence[Collector], engine: Engine, acting: Acting) -> Collector:
-    """Several collectors of one kind as one, over an engine of all their environments."""
+    """Return several collectors of one kind as one, over an engine of all their environments."""
     found: Collector = collectors[0].like(engine, acting)
     found.log_info = collectors[0].log_info
     for name, rows in found.kept.items():

@@ -46,7 +46,7 @@ class OpenCalls:
             "discount": np.zeros(n),  # γ^τ
             "tau": np.zeros(n, np.int64),
         }
-        """Of each environment, (N, …); changed in place."""
+        """State of the open call in each environment, (N, …) each; changed in place."""
         if not hierarchy.goals:  # else its shape is that of the selector's choices
             self.kept["action"] = np.zeros(n, np.int64)  # the choice
         if self.memory_size:
@@ -171,7 +171,7 @@ class OpenCalls:
         return self._laid_out(values, env)
 
     def _at_decisions(self, trace: Trace, ends: Mapping[str, Array]) -> dict[str, Array]:
-        """Return what calls were decided on, (K, …), by the names of a row."""
+        """Return the observations and selector columns of the decisions of K calls, by name."""
         seen = self.level.seen(trace, "next_obs")
         found = {"obs": seen[ends["row"], ends["env"]]}  # if there is no call
         earlier = ends["decided"] < 0
@@ -195,7 +195,7 @@ class OpenCalls:
         return known(values)  # of a member that has diverged, it may be NaN
 
     def _held(self, name: str) -> Array | None:
-        """Return what open calls were decided on, (N, …); None: none was open before."""
+        """Return a column (N, …) of the decisions whose calls were open before; None: none was."""
         kept = self.kept.get(name)
         return self._shaped.get(self.level.path + name) if kept is None else kept
 
@@ -237,7 +237,7 @@ class OpenCalls:
         )
 
     def _keep(self, trace: Trace) -> None:
-        """Keep what was decided of calls that are still open."""
+        """Keep the decisions of calls that are still open, for the next request."""
         env = np.flatnonzero(self.kept["open"] & (self._decided >= 0))
         for name in DECIDED_ON.values():
             if (values := self._decided_on(trace, name)) is None:
@@ -260,7 +260,7 @@ DECIDED_ON = {
 
 
 def as_logits(chances: Array, may: Array) -> Array:
-    """Logits of choices that are as likely as that, but for a share that is uniform.
+    """Return the logits of a guide's choices, of which a small share is uniform.
 
     Args:
         chances: (…, choices).

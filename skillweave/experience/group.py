@@ -43,12 +43,12 @@ class Collectors:
             part.start(seeds / i)
 
     def collect(self, request: Request) -> Collected:
-        """``request.rows`` steps of each environment."""
+        """Step each environment ``request.rows`` times, and return the joined rows."""
         found = [part.collect(request.of_collector(i)) for i, part in enumerate(self.parts)]
         return self._joined(found)
 
     def state(self) -> dict[str, Array]:
-        """Return what ``restore`` needs. It changes nothing."""
+        """Return the states of all collectors, joined, for ``restore``; nothing changes."""
         return joined_states([part.state() for part in self.parts])
 
     def restore(self, state: dict[str, Array]) -> Array:
@@ -57,7 +57,7 @@ class Collectors:
         return self._columns([p.restore(s) for p, s in zip(self.parts, states, strict=True)])
 
     def differing(self) -> Array:
-        """(k,) environments that are not where they were, since they were lost with a worker.
+        """Return the environments (k,) that are in another state since a worker was lost.
 
         Learners have seen them elsewhere, so what was open there must not go on. Each is
         returned once.
@@ -65,7 +65,7 @@ class Collectors:
         return np.empty(0, np.int64)
 
     def finish(self) -> None:
-        """Check at the end of training what it has left in the environments."""
+        """Check at the end of training that it has left nothing in the environments."""
         for part in self.parts:
             part.finish()
 
@@ -80,7 +80,7 @@ class Collectors:
         return collected
 
     def _columns(self, ids: Sequence[Array]) -> Array:
-        """Environments of each collector as columns of the experience."""
+        """Return environments of each collector as columns of the joined rows."""
         count = len(ids)
         each = self.num_envs // self.members  # of a member
         own = each // count  # of a member, in one collector
@@ -112,7 +112,7 @@ def split_states(state: dict[str, Array], count: int) -> list[dict[str, Array]]:
 
 
 def share_of(num_envs: int, workers: int, members: int, name: str) -> int:
-    """Environments of each of ``workers``; those of every member are shared out equally.
+    """Return the number of environments of each of ``workers``; every member's are shared equally.
 
     Raises:
         DeclarationError: they cannot be.

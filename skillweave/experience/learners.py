@@ -38,7 +38,7 @@ CALLS = (*OF_STEP, "elapsed", "skill", "call_elapsed", "call_end", "call_length"
 
 @dataclass(frozen=True)
 class Alone:
-    """One policy acts: that of a plain agent, or of a skill that learns apart. A row is a step.
+    """One acting policy: of a plain agent, or of a skill that learns apart; a row is a step.
 
     A skill's ``termination`` terminates the episode (nothing is worth anything after it), its
     limit truncates it (its value goes on). Then comes a real reset, but for a call that ended at
@@ -52,29 +52,30 @@ class Alone:
     part: OwnPart | None = None
     """The skill's own part of observations and actions; None: it has all."""
     starts: Starts = field(default_factory=Starts)
-    """How its calls start. Rows in which others act until it may start are not valid."""
+    """Start of the skill's calls. Rows in which others act until it may start are not valid."""
     limit: int | None = None
     """The most steps of a call of the skill; None: its ``max_steps``."""
 
 
 @dataclass(frozen=True)
 class Calling:
-    """A selector calls skills, and they may learn from the same steps; see ``LevelLearners``.
+    """A selector that calls skills, which may learn from the same steps; see ``LevelLearners``.
 
     No environment waits for another: where a call is over, the selector decides again, while the
     other calls go on. A call that is open when the rows are full goes on in the next request.
     """
 
     skills: SkillSet
-    """What its choices mean; those that learn have any policy, ``UntrainedHierarchy`` where one is
-    a hierarchy."""
+    """The skills that the selector chooses from. Those that learn have a placeholder as policy,
+    ``UntrainedHierarchy`` where one is a hierarchy."""
     guide: ActiveGuide | None = None
     """A ready selector that is asked wherever it decides."""
     skill: Skill | None = None
-    """That all of it is, in another hierarchy: its reward and its ends count; None: the task's."""
+    """The skill that this hierarchy is in another one, whose reward and ends count; None: those of
+    the task count."""
     keep_rewards: bool = False
-    """Of each call, keep the reward of every step, so that others may learn from it with a γ of
-    their own."""
+    """Keep the reward of every step of each call, so that other learners may discount it with their
+    own γ."""
 
 
 class OneLearner:
@@ -103,7 +104,7 @@ class OneLearner:
         self.overrides = bool(who.reflexes)
 
     def begin(self, request: Request, elapsed: Array) -> None:
-        """Act by this request from now on; ``elapsed`` (N,) are steps of calls so far."""
+        """Act by a request from now on; ``elapsed`` (N,) are steps of calls so far."""
         assert self._acting is not None
         self._acting.begin(request)
         self._record = request.record
@@ -119,7 +120,7 @@ class OneLearner:
         self._acting.row = out.row + 1
 
     def views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
-        """Return what each learner did, by path.
+        """Return the rows of the one learner, at the path "".
 
         Args:
             steps: as those who act are judged by them.
@@ -196,7 +197,7 @@ class LevelLearners:
                     self.values[f"{level.path}action"] = range(level.hierarchy.choices)
 
     def begin(self, request: Request, elapsed: Array) -> None:
-        """Act by this request from now on; ``elapsed`` (N,) are steps of the episodes so far."""
+        """Act by a request from now on; ``elapsed`` (N,) are steps of the episodes so far."""
         self._record, self._gammas = request.record, dict[str, Array]()  # by path, (N,)
         if self._acting is not None:
             self._begin("", self._acting, request)
@@ -226,7 +227,7 @@ class LevelLearners:
         return any(s.defines(method) for s in judges for method in ("reward", "termination"))
 
     def write(self, out: TraceWriter, end: Array, whole: bool) -> None:
-        """Write which calls run after a step, and why others ended.
+        """Write into the trace which calls run after a step, and why others ended.
 
         Args:
             out: the trace.
@@ -256,7 +257,7 @@ class LevelLearners:
             out.write(**{path + name: x for name, x in values.items()})
 
     def views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
-        """Return what each learner did, by path.
+        """Return the rows of each learner, by path.
 
         Args:
             steps: as those who act are judged by them.
@@ -266,7 +267,7 @@ class LevelLearners:
         return dict(self._of_level(trace, self.root, steps, end, end != RUNNING))
 
     def log(self, trace: Trace, info: Sequence[str]) -> Batch:
-        """Return the steps with what calls did in them; ``info`` are keys that are logged."""
+        """Return a trace's steps with their calls, for a log of calls; ``info`` are its keys."""
         over = trace["call_end"] != RUNNING
         skills = self.root.skills
         goals = (f"{skill.name}/goal" for skill in skills)
@@ -277,7 +278,7 @@ class LevelLearners:
     def _of_level(
         self, trace: Trace, level: LearningLevel, steps: Batch, end: Array, closes: Array
     ) -> Iterator[tuple[str, Batch]]:
-        """Yield what the learners of a level did, by path, and of those below it.
+        """Yield the rows of a level's learners, by path, and of those below it.
 
         Args:
             steps: see ``OpenCalls.calls_of``.
@@ -301,7 +302,7 @@ class LevelLearners:
 
     @staticmethod
     def _of_critic(trace: Trace, level: LearningLevel, steps: Batch) -> Batch:
-        """Return all steps of a level, for its critic."""
+        """Return the rows of a level's critic: all steps of the level."""
         acts = steps["valid"]
         running = trace[level.path + "skill"]
         seen = {name: level.seen(trace, name) for name in ("obs", "next_obs")}
@@ -321,7 +322,7 @@ class LevelLearners:
     def _of_skill(
         self, trace: Trace, level: LearningLevel, i: int, acts: Array, end: Array
     ) -> Batch:
-        """Return what a skill that learns did, judged by its own reward and ends."""
+        """Return the rows of a skill that learns, judged by its own reward and ends."""
         skill = level.skills[i]
         part = level.skill_set.part(i)
         goals = level.hierarchy.goals.get(i)
@@ -360,14 +361,14 @@ class LevelLearners:
 def _completed(
     batch: Batch, space: gym.Space[Any], before: tuple[Array, Array] | None, goes_on: Array
 ) -> Batch:
-    """Return a batch with actions, also where nobody acted, and with what a network remembered.
+    """Return a learner's rows, with actions in all of them, and a recurrent network's state.
 
     Args:
         batch: (T, N).
         space: of the actions.
-        before: what a recurrent network remembered before, (N, M), and (N,) bool, that was
-            nothing; None: it is not recurrent.
-        goes_on: (T, N) bool, it remembers what was before the next row.
+        before: a recurrent network's state before these rows, (N, M), and where it was empty, (N,)
+            bool; None: it is not recurrent.
+        goes_on: (T, N) bool, the state stays until the next row.
     """
     if "action" not in batch:
         batch = batch.replace(action=action_codec(space).zeros(*batch.lead))

@@ -24,16 +24,16 @@ from skillweave.types import Array, Policy
 
 @dataclass(frozen=True)
 class UntrainedHierarchy:
-    """Stands for the policy of a skill that is a hierarchy and learns."""
+    """A placeholder for the policy of a skill that is a hierarchy and learns."""
 
     skills: SkillSet
-    """Those that learn have any policy."""
+    """The skills; the policies of those that learn are not used."""
     selector: Policy | None
-    """None: it learns."""
+    """The ready selector; None: it learns."""
     guide: ActiveGuide | None = None
-    """A ready selector beside it."""
+    """A ready selector beside the learning one."""
     goals: Goals | None = None
-    """Its own, as a skill that has goals."""
+    """The hierarchy's own goals, as a skill that has goals; None: it has none."""
 
     @property
     def action_space(self) -> gym.Space[Any]:
@@ -53,6 +53,7 @@ def with_learners(
     """
 
     def policy_of(skill: Skill, policy: Any) -> Any:
+        """Return the acting learner of a skill, or its ready policy."""
         name = path + skill.name
         if name in learners:
             return Learning(learners[name], name)
@@ -74,7 +75,7 @@ def with_learners(
 
 
 def own_memory(memory: Memory) -> Memory:
-    """Return what a skill's own policy remembers, without what it corrects."""
+    """Return the memory of a skill's own policy, without that of the base policy it corrects."""
     own: Memory = memory.get("own", memory)
     return own
 
@@ -95,19 +96,19 @@ class LearningLevel:
 
     skill_set: SkillSet
     hierarchy: CallAndReturn
-    """Of these skills."""
+    """The acting policy of these skills and their selector."""
     memory: Memory
-    """What it remembers, of all environments; changed in place."""
+    """The hierarchy's memory, of all environments; changed in place."""
     learners: Mapping[str, Acting]
-    """By path, all who learn below the first selector."""
+    """All policies that learn below the outermost selector, by path."""
     skill: Skill | None = None
-    """That all of it is, in another hierarchy."""
+    """The skill that this level is in another hierarchy; None: it is the outermost one."""
     path: str = ""
-    """Of these skills, as columns of a trace have it: empty, or ``inner/`` for example."""
+    """Prefix of this level's columns in a trace: empty, or ``inner/`` for example."""
 
     @cached_property
     def goals(self) -> Goals | None:
-        """Its own, as a skill that has goals."""
+        """The level's own goals, as a skill that has goals; None: it has none."""
         return goals_of(self.skill)
 
     @property

@@ -44,7 +44,7 @@ class Starts:
     """Names among ``skills``; in a share of the episodes a call of one of them comes last before
     the skill starts."""
     named_share: float = NAMED_SHARE
-    """That share."""
+    """The share of episodes in which a named call comes last."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -53,12 +53,12 @@ class Starts:
 
     @property
     def named(self) -> tuple[str, ...]:
-        """Those of ``after`` that can act already."""
+        """The names in ``after`` of skills that can act already."""
         return tuple(name for name in self.names if name in self.after)
 
     @property
     def draws(self) -> bool:
-        """Calls come first, and how many is drawn for each episode."""
+        """True if calls of other skills come first, a number that is drawn for each episode."""
         return self.skills is not None and (self.calls > 0 or bool(self.named))
 
     def search(self, skill: Skill | None, engine: Engine) -> Search | None:
@@ -78,7 +78,7 @@ class Search:
     act as a selector lets them act, because their ends are the states to learn in.
 
     Args:
-        skill: that is to start.
+        skill: the skill that is to start.
         starts: how.
         engine: the environments.
     """
@@ -99,7 +99,7 @@ class Search:
             "found": np.zeros(n, bool),  # it ever might
             "calls_left": np.zeros(n, np.int64),  # that come first; −1: to be drawn
         }
-        """What is kept of each environment, (N, …) each; changed in place."""
+        """State of the search in each environment, (N, …) each; changed in place."""
         if self._named:
             self.kept["named"] = np.zeros(n, bool)  # the last of these calls must be named
             self.kept["sought"] = np.zeros(n, np.int64)  # steps until one ended; −1: one has
@@ -108,7 +108,7 @@ class Search:
         self.holds = False
         """The last action counts for who is called."""
         if starts.skills is not None:
-            # The last action is in the ``World``: others act, too.
+            # Not outermost: the collector keeps the last action, as the skill itself acts, too.
             skills = starts.skills if self._named else replace(starts.skills, greedy=False)
             self._policy = acting_policy(skills, outermost=False)
             self._hierarchy = within(self._policy)
@@ -213,17 +213,17 @@ class Search:
 
     @property
     def given_up(self) -> Array:
-        """(N,) bool, environments in which the skill cannot start, as it seems."""
+        """Return the environments in which the skill seems unable to start, (N,) bool."""
         found: Array = self.kept["searched"] > PATIENCE
         return found
 
     def _runs(self, ids: Array) -> Array:
-        """(k,) bool, a call of another skill runs."""
+        """Return where a call of another skill runs, (k,) bool."""
         runs: Array = self.memory["end"][ids] == RUNNING
         return runs
 
     def _stop(self, ids: Array) -> None:
-        """End calls of others in environments ``ids`` (k,): the skill starts, or an episode."""
+        """End other skills' calls in environments ``ids`` (k,): the skill or an episode starts."""
         if self.starts.skills is not None:
             restart(self._policy, self.memory, ids)
 
@@ -301,7 +301,7 @@ class Search:
             )
 
     def _sought(self) -> str:
-        """Describe what searched for a start."""
+        """Return words on the search for a start, for messages."""
         by = "random acting"
         if self.starts.skills is not None:
             by = f"calling {', '.join(map(repr, self.starts.names))}"

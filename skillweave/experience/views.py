@@ -1,4 +1,4 @@
-"""Views of a trace: what each learner did, judged by its own skill after the steps were made.
+"""Views of a trace: each learner's rows, judged by its own skill after the steps were made.
 
 Everything here is a function of the trace's columns. Nothing else calls a skill's reward and
 success on recorded steps; its reward is called once for all rows of a request in which it acted.
@@ -57,7 +57,7 @@ def stops(skill: Skill, step: Step, ids: Array) -> Array:
 
 @dataclass(frozen=True)
 class OwnSteps:
-    """The steps of a trace in which a skill, or who does the task, acts."""
+    """The steps of a trace in which a skill acts, or the policy of the task."""
 
     trace: Trace
     skill: Skill | None
@@ -76,7 +76,7 @@ class OwnSteps:
         return cls(trace, skill, acts, trace[path + "call_elapsed"], goal)
 
     def rows(self, end: Array) -> Batch:
-        """Return these steps, judged by the skill's own reward and ends.
+        """Return the rows of these steps, judged by the skill's own reward and ends.
 
         Args:
             end: (T, N) int8, ``CallEnd`` of its call after the step.
@@ -128,7 +128,7 @@ class OwnSteps:
         return found
 
     def _answers(self, skill: Skill, what: str, part: slice) -> Array:
-        """Return what a skill answers in the rows ``part``, (K,) by time."""
+        """Return a skill's reward or success in the rows ``part``, (K,) by time."""
         acts = self.acts[part]
         infos = self.trace.infos[part]
         every = acts.all()
@@ -199,7 +199,7 @@ def rows_of(
     goals: Goals | None = None,
     part: OwnPart | None = None,
 ) -> Batch:
-    """Return the steps of a learner with all that it may learn from.
+    """Return the rows of a learner: its judged steps, with the columns that it learns from.
 
     Args:
         path: before the names of the learner's own columns: empty, or ``inner/up/``.
@@ -288,7 +288,7 @@ class JointInfo(Mapping[str, Any]):
         return any(given)
 
     def get(self, key: str, default: Any = None) -> Any:
-        """Return what environments give under a key in these steps, without what is missing."""
+        """Return a key's values in the ``info`` of these steps, or ``default``: no one has it."""
         given = key in self
         return self[key] if given else default
 

@@ -15,7 +15,7 @@ from skillweave.types import Array
 
 
 class TraceWriter:
-    """Writes the rows of a trace, from the first to the last.
+    """A writer of a trace, from the first row to the last.
 
     A column exists from its first value on; what is not written has the column's ``fill``.
 
@@ -61,7 +61,7 @@ class TraceWriter:
         self.row += 1
 
     def trace(self) -> Trace:
-        """Return what was written."""
+        """Return the rows written so far as a trace."""
         whole = self.row == self._lead[0]
         columns = {k: v if whole else v[: self.row] for k, v in self._columns.items()}
         return Trace(self._infos or (), columns)

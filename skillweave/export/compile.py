@@ -79,7 +79,7 @@ def _compiled(policy: RowPolicy, name: str, *, sampled: bool) -> RowPolicy:
 
 
 def _leaf(policy: Returns, where: str, sampled: bool) -> RowPolicy:
-    """Return what is no combinator: a network, or a function."""
+    """Return a leaf of the exported tree: a network, or a user's function."""
     inside = policy.policy
     if isinstance(inside, AgentPolicy):
         return agent_graph(inside, sampled, where)

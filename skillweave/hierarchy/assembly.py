@@ -16,7 +16,7 @@ from skillweave.types import Policy
 
 
 def assembled(roles: Roles, policies: Mapping[str, Policy], path: str = "") -> HierarchyPolicy:
-    """Return the policy of a level from policies by path."""
+    """Return the hierarchy policy of a level, made of the policies of its parts, by path."""
     whole: dict[str, Any] = dict(policies)
     for level in reversed(roles.levels_from(path)):
         skills = level.skill_set({p: whole[p] for p in level.skills})

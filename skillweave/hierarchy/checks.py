@@ -23,7 +23,7 @@ from skillweave.training.stage import target_of
 
 
 def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ...]:
-    """Return the skills as a tuple, with hierarchies among them as skills.
+    """Check declared skills; return them as a tuple, each hierarchy among them as a skill.
 
     Raises:
         DeclarationError: no hierarchy can be made of them.
@@ -88,7 +88,7 @@ def _check_untrained(skill: Skill) -> None:
 
 
 def _distance(skill: Skill, field: str) -> int:
-    """Return the place of a skill's field: 0 on the object, 1 in its class, more in those above."""
+    """Return how far a skill's setting is declared: 0 on the object, 1 in its class, more above."""
     places = [vars(skill), *map(vars, type(skill).__mro__)]
     return next((i for i, names in enumerate(places) if field in names), len(places))
 
@@ -180,7 +180,7 @@ def _check_calls(level: Level) -> None:
 
 
 def _undoes_call_steps(skill: Skill) -> bool:
-    """Return whether a skill that ends itself says call_steps = None in its class.
+    """Return whether a skill's class has both a termination and call_steps = None.
 
     A None that takes back the number of a class above is meant so.
     """
@@ -262,7 +262,7 @@ def _check_same_env(name: str, spec: EnvSpec, other: EnvSpec) -> None:
 
 
 def check_target(skill: Skill) -> Target | None:
-    """Return the target of a skill's stage.
+    """Check a declared skill's target, and return it as that of its stage.
 
     Raises:
         DeclarationError: the skill has two targets, or has one of success without success().

@@ -178,7 +178,7 @@ class Declaration(Nestable, Declared):
         return PlainAgent(self.env, config, steps, train_defaults=self.train_defaults)
 
     def check_spaces(self) -> Spaces:
-        """Make the environment once, and return its spaces.
+        """Make the declared environment once, and return its spaces.
 
         Raises:
             DeclarationError: a space, a setting or a policy does not fit.

@@ -111,6 +111,7 @@ def ready_selectors(roles: Roles) -> dict[str, Policy]:
 
 
 def _fitted(policy: Policy, role: Role, who: str) -> Policy:
+    """Return a ready policy, fitted to the spaces of the role in which it acts."""
     env = role.spec.name
     if role.part is not None:
         env += PART

@@ -25,7 +25,7 @@ from skillweave.types import Array, Policy
 
 @checked_names
 class HierarchyPolicy(Functional):
-    """A selector and its skills as one policy; its memory is that of ``policies.Hierarchy``.
+    """A selector and its skills as one policy; its memory is that of ``CallAndReturn``.
 
     Args:
         selector: chooses a row of the skills.
@@ -102,7 +102,7 @@ class HierarchyPolicy(Functional):
 
 
 def with_interruption(skills: SkillSet, critic: Any, margin: float) -> SkillSet:
-    """Return the skills with calls that end where a trained critic prefers a new decision."""
+    """Return a skill set in which a trained critic ends calls where it prefers a new decision."""
     return replace(skills, interruption=Interruption(critic.heads, margin, critic))
 
 

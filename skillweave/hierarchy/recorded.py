@@ -19,7 +19,7 @@ from skillweave.types import Policy
 
 
 def skill_entries(roles: Roles, ready: Mapping[str, Policy]) -> list[SkillEntry]:
-    """Return the entries of the skills of all levels.
+    """Return the entries of the skills of all levels, for ``run.json``.
 
     Args:
         roles: with the skills.
@@ -29,7 +29,7 @@ def skill_entries(roles: Roles, ready: Mapping[str, Policy]) -> list[SkillEntry]
 
 
 def _skill_entry(roles: Roles, path: str, policy: Policy | None) -> SkillEntry:
-    """Return the entry of a skill; ``policy`` is ready, or the skill corrects it."""
+    """Return a skill's entry for ``run.json``; ``policy`` is ready, or the skill corrects it."""
     skill = roles.skills[path]
     goals_of(skill)  # a space that is not supported is named with its skill
     return SkillEntry(
@@ -45,7 +45,7 @@ def _skill_entry(roles: Roles, path: str, policy: Policy | None) -> SkillEntry:
 
 
 def level_entry(roles: Roles, level: Level) -> LevelEntry:
-    """Return the entry of a level.
+    """Return a level's entry for ``run.json``: its settings.
 
     Unless all its parts learn together in a stage, skills and selector are greedy by default.
     """
@@ -78,12 +78,12 @@ def level_entry(roles: Roles, level: Level) -> LevelEntry:
 
 
 def calls_of(entry: LevelEntry) -> int | Lengths | None:
-    """Return the limit of calls that a level's entry records."""
+    """Return the limit of calls in a level's entry of ``run.json`` or a weights file."""
     return Lengths(*entry.call_lengths) if entry.call_lengths else entry.call_steps
 
 
 def with_entry(level: Level, entry: LevelEntry) -> Level:
-    """Return a level with the settings that a file records."""
+    """Return a level with the settings of its entry in ``run.json`` or a weights file."""
     guide, margin = level.guide, entry.interrupt
     if guide is not None and entry.guide is not None:
         guide = replace(guide, restrict=entry.guide.restrict, target_kl=entry.guide.target_kl)

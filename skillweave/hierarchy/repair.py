@@ -99,6 +99,7 @@ def repair_stage(
     assert config is not None
 
     def learning_task(policies: Policies) -> LearningTask:
+        """Return the task of the repaired skill, which starts where the other one ends."""
         others = {p: policy_at(roles, policies, p) for p in level.skills if p != path}
         whole = level.skill_set({p: policy_at(roles, policies, p) for p in level.skills})
         limit = whole.limit(list(level.skills).index(path))
@@ -133,7 +134,7 @@ def repair_stage(
 
 
 def event_of(skill: Skill, done: Mapping[str, Any] | None) -> Callable[[Step], Array] | None:
-    """Return where the event that a skill's call is for holds in a step; None: there is none.
+    """Return a function of steps: where the repaired skill's event holds; None: it has no event.
 
     Of ``held(...)``, where the predicate inside holds: so each of its steps counts.
     """
@@ -231,7 +232,7 @@ def measure(
     num_envs: int,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Measured:
-    """Let skills act until one was called after another one often enough; return what happened.
+    """Let skills act until one was called after another one often enough; return the handover.
 
     Args:
         skills: of one level; ``skill`` and ``after`` are names there.
@@ -289,6 +290,7 @@ def measure(
 
 
 def _sum(one: Handover, other: Handover) -> Handover:
+    """Return the sum of two handover matrices of the same skills."""
     added = ("calls", "done", "began_late", "steps", "cut_else")
     counts = {k: getattr(one, k) + getattr(other, k) for k in added}
     limit = max(one.time_limit, other.time_limit)
@@ -331,7 +333,7 @@ def rehearsed_obs(
 
 
 def matrix_to_json(matrix: Handover) -> Matrix:
-    """Return a matrix as a run records it."""
+    """Return a handover matrix as ``run.json`` records it."""
     calls, done, late = (x.tolist() for x in (matrix.calls, matrix.done, matrix.began_late))
     needed = None if matrix.needed is None else matrix.needed.tolist()
     by_itself = list(matrix.by_itself)
@@ -340,7 +342,7 @@ def matrix_to_json(matrix: Handover) -> Matrix:
 
 
 def matrix_from_json(entry: Matrix) -> Handover:
-    """Return the matrix of ``matrix_to_json``."""
+    """Return the handover matrix of a repair's entry; the inverse of ``matrix_to_json``."""
     columns = (entry.calls, entry.done, entry.began_late)
     calls, done, late = (np.array(x, np.int64) for x in columns)
     needed = None if entry.needed is None else np.array(entry.needed, np.int64)
@@ -352,7 +354,7 @@ def matrix_from_json(entry: Matrix) -> Handover:
 def judge_repair(
     roles: Roles, course: Course, entry: StageEntry, repair: RepairEntry, later: HierarchyPolicy
 ) -> bool:
-    """Measure a repaired skill once, and record whether it is kept; return that.
+    """Measure a repaired skill once, and record in the run whether it is kept; return that.
 
     Args:
         later: the hierarchy with the repaired weights.
@@ -398,6 +400,7 @@ def verdict(before: Handover, later: Handover, skill: str, after: str) -> tuple[
 
 
 def _rates(before: Handover, later: Handover, place: tuple[int, int]) -> str:
+    """Return words on a pair's rate in the handover matrices before and after a repair."""
     one, other = (shown_rate(m.done[place], m.calls[place]) for m in (before, later))
     return f"{one} before, {other} later"
 

@@ -227,6 +227,7 @@ class Roles:
         return {role.path: role for role in self._in_level("")}
 
     def _in_level(self, path: str) -> Iterator[Role]:
+        """Yield the roles of a level and of those below it."""
         level = self.levels[path]
         for path in level.skills:
             yield level.role_of_skill(path, self.spec)
@@ -311,6 +312,7 @@ class Roles:
         """
 
         def change(level: Level) -> Level:
+            """Return a level with restored ready policies in its residual skills."""
             skills = dict(level.skills)
             for path, skill in level.skills.items():
                 part = self[path].part if isinstance(skill.policy, Residual) else None
@@ -345,6 +347,7 @@ def hierarchies_of(declared: H) -> dict[str, H]:
     found: dict[str, H] = {}
 
     def add(hierarchy: H, path: str, above: tuple[H, ...]) -> None:
+        """Add a hierarchy and those below it; one may not contain itself."""
         if any(hierarchy is other for other in above):
             raise DeclarationError(
                 f"{path} is a hierarchy that contains itself: it is among its own skills"

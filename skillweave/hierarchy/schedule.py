@@ -201,7 +201,7 @@ def _task_weights(roles: Roles, level: Level) -> dict[str, float]:
 
 
 def _with_epsilon(config: Any, settings: Together) -> Any:
-    """Return a selector's settings, with the epsilon of learning together where it sets none."""
+    """Return a selector's settings; if they lack epsilon, with that of ``together``."""
     if not isinstance(config, PPO) or config.epsilon:
         return config
     default = PPO()
@@ -268,6 +268,7 @@ def _skill_stage(roles: Roles, level: Level, path: str, budget: int) -> Stage:
     assert role.config is not None
 
     def learning_task(policies: Policies) -> LearningTask:
+        """Return the task of one skill, whose start may be searched by other skills."""
         others = {
             p: policy_at(roles, policies, p) for p in level.skills if can_act(roles, p, policies)
         }

@@ -34,7 +34,8 @@ FEWEST = 5
 SHARE = 0.1
 """Share of the stage's steps that the episodes of a candidate may take."""
 SHORT_SHARE = 0.05
-"""The same share where it would not hold ``LEAST``: there are at most five candidates."""
+"""Share of the stage's steps that a candidate's episodes may take where ``SHARE`` is too little
+for ``LEAST``; there are at most five candidates."""
 CLEARLY = 2.0
 """Standard errors by which a sampling selector must be better than a greedy one to replace it, as
 users expect a greedy one; and training episodes better than all, so that it is said."""
@@ -81,7 +82,7 @@ def select_best(
 
 
 def _episodes(entry: StageEntry) -> int:
-    """Return the number of episodes for each candidate: fewer where episodes are long, or 0."""
+    """Return the number of episodes of each candidate: fewer where episodes are long, or 0."""
     steps = entry.steps or 0
     length = entry.final.get("length") or steps / entry.num_envs
     episodes = round(SHARE * steps / length)
@@ -98,7 +99,7 @@ def _scores(
     after: Policies,
     episodes: int,
 ) -> dict[str, Evaluation]:
-    """Return the evaluations of all candidates, by name."""
+    """Return the evaluations of all candidates, hierarchies before and after a stage, by name."""
     entry = run.stage(join(level.path, TOGETHER))
     spec = roles.spec
     seed = SEEDS + run.manifest.seed
@@ -109,6 +110,7 @@ def _scores(
         max_steps = max(1, (entry.steps or 0) // num_envs)
 
     def score(decided: Roles, policies: Policies) -> Evaluation:
+        """Return the evaluation of one candidate, in the same episodes as the others."""
         policy = assembled(decided, policies, level.path)
         return evaluate(
             policy,
@@ -137,7 +139,7 @@ def _scores(
 
 
 def _best(scores: Mapping[str, Evaluation]) -> Candidate:
-    """Return the candidate with the best mean; a selector samples only if it is clearly better."""
+    """Return the best candidate by mean return; a selector samples only if clearly better."""
     by_mean: list[Any] = sorted(scores, key=lambda name: -scores[name].mean)  # of equals the first
     greedy: Candidate = next(k for k in by_mean if k == "before" or not SAMPLING[k][1])
     first = scores[by_mean[0]]
@@ -170,7 +172,7 @@ def resolve_greedy(roles: Roles, run: RunDirectory) -> Roles:
 
 
 def _with_sampling(level: Level, skills: bool, selector: bool) -> Level:
-    """Set whether skills and selector sample, where a level leaves that open."""
+    """Return a level with skills and selector greedy or sampling, where it leaves that open."""
     choice = level.selection
     decided = replace(
         choice,

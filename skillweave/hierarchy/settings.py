@@ -71,8 +71,9 @@ class Selection:
     learn apart; where they learn together, episodes of both kinds are played at the end, and the
     better kind is kept. After a training too short for such episodes, they sample."""
     greedy_selector: bool | None = None
-    """The same for the selector. None: greedy, unless skills and selector learn together and a
-    sampling selector is clearly better at the end: a greedy one can call one skill forever."""
+    """True: the selector acts greedily after training. False: it samples. None: greedy, unless
+    skills and selector learn together and a sampling selector is clearly better at the end: a
+    greedy one can call one skill forever."""
     target_return: float | None = None
     """The selector's stage ends early at this mean return of the evaluation while training."""
 
@@ -114,7 +115,7 @@ SelectorValue = Annotated[
 ]
 """A selector that is trained, or a ready one."""
 Learn = Literal["together", "apart", "apart, then together"]
-"""Which of skills and selector learn from the same steps."""
+"""Ways of learning: skills and selector from the same steps, one after the other, or both."""
 USUAL_CALL_STEPS = 40
 """The default of ``Hierarchy.call_steps``."""
 

@@ -43,7 +43,7 @@ def manifest(
     flat: bool | AlgorithmConfig = False,
     how: TrainDefaults | None = None,
 ) -> Manifest:
-    """Return the content of a new run's ``run.json``.
+    """Return the content of ``run.json`` for a new run of a declaration.
 
     Args:
         flat: a manifest of the flat baseline: with its own settings, or with these.
@@ -101,7 +101,7 @@ def train(
     make_learner: MakeLearner = Agents,
     done: Mapping[str, Any] | None = None,
 ) -> Policy:
-    """Train, or finish training, the stages of a run; return the policy.
+    """Train, or finish training, the stages of a declaration's run; return its policy.
 
     Args:
         done: the events by which a repair is judged, as for ``planning.handover``.
@@ -172,7 +172,7 @@ def load(roles: Roles, run: RunDirectory) -> Policy:
 
 
 def _learnt(run: RunDirectory) -> dict[str, Policy]:
-    """Return the trained policies of a finished run, by path."""
+    """Return the trained policies of a hierarchy's finished run, by path."""
     policies: dict[str, Policy] = {}
     for entry in run.manifest.stages:
         if not entry.undone:

@@ -55,7 +55,7 @@ def write_agent(path: Path, spec: EnvSpec, policy: AgentPolicy) -> None:
 
 
 def _place(spec: EnvSpec) -> dict[str, Any]:
-    """Return the fields of headers that name an environment."""
+    """Return the fields of a weights file's header that name its environment."""
     return {"env": spec.name, "env_kwargs": spec.json_kwargs}
 
 
@@ -91,6 +91,7 @@ def write_weights(
             tensors |= _content_of(own_part.base, f"{name}.base")
 
     def decided(level: Level) -> Level:
+        """Return a level's settings with its policy's choice of greedy or sampling."""
         # The policy records whether skills and selector are greedy, if the level leaves it open.
         whole = parts[level.path]
         assert isinstance(whole, HierarchyPolicy)
@@ -111,7 +112,7 @@ def write_weights(
 
 
 def _content_of(policy: Policy, name: str) -> dict[str, Tensor]:
-    """Return the content of a ready policy, under its name; {}: it has none."""
+    """Return the content of a ready policy as a tensor of a weights file; {}: it has none."""
     if not isinstance(policy, Foreign) or (content := policy.content()) is None:
         return {}
     numbers = np.frombuffer(content, np.uint8)
@@ -162,7 +163,7 @@ def read_weights(
 
     Args:
         roles: as declared.
-        tensors, header: what ``open_weights`` read from ``path``.
+        tensors, header: as ``open_weights`` read them from ``path``.
 
     Raises:
         RunError: the file is damaged, or belongs to other skills or another environment.
@@ -209,7 +210,7 @@ def read_weights(
 
 
 def _content(tensors: Mapping[str, Tensor], name: str) -> bytes | None:
-    """Return the content of a ready policy under a name; None: the file has none."""
+    """Return the content of a ready policy in a weights file, by its name; None: it has none."""
     copied = tensors.get(join(name, "content"))
     return None if copied is None else copied.contiguous().numpy().tobytes()
 

@@ -38,7 +38,7 @@ class QNet:
         self._actions = actions
         self._atoms = atoms
         self.streams: list[tuple[str, Network, int]] = []
-        """Of a dueling network: name, hidden layers and outputs of each stream; else none."""
+        """Name, hidden layers and outputs of each stream of a dueling network; else none."""
         if dueling:
             trunk = replace(network, hidden=network.hidden[:-1])
             last = network.hidden[-1:]

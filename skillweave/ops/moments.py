@@ -21,7 +21,7 @@ def is_constant(mean: Tensor, var: Tensor) -> Tensor:
 
 
 def scale_of(mean: Tensor, var: Tensor, eps: float = 1e-8) -> Tensor:
-    """Return what numbers are divided by: their deviation, or 1 where they were constant.
+    """Return the divisor of normalised numbers: their deviation, or 1 where they are constant.
 
     A deviation of nearly 0 would make the first change of a number a huge one.
 

@@ -13,7 +13,7 @@ from skillweave.ops.moments import CLIP, scale_of
 FEWEST = 1_000
 """The fewest observations whose range says what is usual."""
 BEYOND = 10.0
-"""How many widths of the range a number must be outside: a wrong unit, or -999 for "unknown"."""
+"""Widths of the range by which a number must be outside: a wrong unit, or -999 for "unknown"."""
 
 
 @dataclass
@@ -31,7 +31,7 @@ class Seen:
     low: Tensor  # (O,)
     high: Tensor  # (O,)
     count: Tensor | int
-    """How many were seen; of less than ``FEWEST`` nothing is named."""
+    """The number of observations seen; below ``FEWEST`` no number is reported."""
 
     def __post_init__(self) -> None:
         self._quiet = bool(self.count < FEWEST)

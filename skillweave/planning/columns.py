@@ -324,7 +324,7 @@ def columns_of(log: CallColumns) -> dict[str, Array]:
 
 
 def fields_of(columns: Mapping[str, Array]) -> dict[str, Any]:
-    """Return the fields of a log whose ``columns_of`` these are."""
+    """Return the fields of a log from its arrays; the inverse of ``columns_of``."""
     plain = dict[str, Array]()
     info = dict[str, Array]()
     goals = dict[str, Array]()

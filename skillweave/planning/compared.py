@@ -1,4 +1,4 @@
-"""The numbers of observations by which calls are compared, where nobody names any."""
+"""The numbers of observations by which calls are compared, where the user names none."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
 
     Args:
         log: the calls.
-        task: that is planned; None: the numbers are for any.
+        task: the planned task; None: the numbers are for any.
     """
     space = log.observation_space
     codec = obs_codec(space)
@@ -154,6 +154,7 @@ def _predict(few: Array, many: Array, values: Array) -> bool:
     wanted = Standard(values)(values)
 
     def error(seen: Array) -> float:
+        """Return the squared error of predicting a point by its nearest neighbors."""
         points = Standard(seen)(seen).astype(np.float32)
         near, _ = nearest(points, points, NEIGHBORS + 1, np.arange(len(points)))
         others = near != np.arange(len(points))[:, None]

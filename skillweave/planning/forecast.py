@@ -73,9 +73,8 @@ class Forecast:
         unsure: the skills that are often called where the log has no call of them near.
         reason: why the chance is small or unknown; empty: it is neither.
         goals: of each of the calls, its goals in words; empty: it has none.
-        already: which words of the mission hold before anything is done; empty: the mission asks
-            for something.
-        episodes: that were played, whose share the chance is; 0: none.
+        already: the words of the mission that hold before anything is done; empty: none does.
+        episodes: the number of played ones, whose share the chance is; 0: none.
     """
 
     calls: tuple[tuple[str, float], ...]
@@ -89,7 +88,7 @@ class Forecast:
     episodes: int = 0
 
     def __str__(self) -> str:
-        """Return all of it as a line."""
+        """Return the forecast as a line."""
         goals = self.goals or ("",) * len(self.calls)
         names = [
             f"{name}{goal and ' '}{goal} ({steps:.0f} steps)"
@@ -175,7 +174,7 @@ class _Calls:
         log, pieces = graph.log, graph.pieces
         starts = log.before[pieces.first]
         self._of: list[tuple[Array, Array, float]] = []
-        """Of each choice its pieces, where they start, and the usual distance of others."""
+        """The pieces of each choice, their starts, and the usual distance of others."""
         for choice in range(log.choices):
             rows = np.flatnonzero((pieces.choice == choice) & some[pieces.call])
             usual = 0.0
@@ -233,7 +232,7 @@ class _Calls:
 
 
 def forecast(planner: Planner) -> Forecast:
-    """Return how episodes of a plan probably go.
+    """Return the forecast of a plan: how episodes that follow it along logged calls end.
 
     From logged starts, each choice is the plan's, as it would be played; then one of the nearest
     logged calls, by start and goal, is followed to its end. Calls that began too late before the
@@ -288,12 +287,12 @@ def forecast(planner: Planner) -> Forecast:
 
 
 def played(expected: Forecast, done: int | None, episodes: int, steps: float) -> Forecast:
-    """Return a forecast with what played episodes did in place of what was expected.
+    """Return a forecast with the results of played episodes in place of the expected ones.
 
     Args:
         expected: before they were played.
         done: the episodes that succeeded; None: the task has no accepting state.
-        episodes: how many were played.
+        episodes: the number that were played.
         steps: their mean steps.
     """
     share = None
@@ -444,7 +443,7 @@ def _pooled(halves: Sequence[tuple[float, float, float]]) -> tuple[float, float]
 
 
 def _running(skill: Array) -> LastCall:
-    """Return that calls of skills (k,) go on."""
+    """Return last calls of skills (k,) that have not ended, for a plan's selector."""
     n = len(skill)
     return LastCall(skill, np.full(n, CallEnd.RUNNING, np.int8), np.zeros(n, bool))
 
@@ -482,7 +481,7 @@ def _usual_calls(
 
 
 def _unknown(planner: Planner) -> str:
-    """Return why the log cannot say how likely a plan is."""
+    """Return the reason why a log cannot say how likely a plan succeeds."""
     log = planner.graph.log
     if (episodes := len(np.unique(log.episode))) < FEWEST_EPISODES:
         return (

@@ -133,6 +133,7 @@ def reached(function: Callable[[Array, Array], Any], goal: Any) -> Predicate:
 
 
 def _goal(value: Any) -> Array:
+    """Return a goal of a task as float64 numbers (G,)."""
     try:
         goal = np.atleast_1d(np.asarray(value))
         if goal.dtype.kind not in "iuf":

@@ -93,7 +93,7 @@ class CallGraph:
         neighbors: K.
         skills: for initiation sets in observations that are not in the log; None: those that were
             recorded at the ends of calls.
-        task: that will be planned, as far as it is known; see ``compared_places``.
+        task: the task that will be planned, as far as it is known; see ``compared_places``.
 
     Raises:
         RunError: the log has less than two calls.
@@ -315,6 +315,7 @@ class CallGraph:
         discounts: Array = discount.astype(np.float32)[:, None]
 
         def worth_of(value: Array) -> Array:
+            """Return the worth of all pieces (P, M), of the values of ends."""
             worth: Array = np.zeros_like(reward)
             ends = self.end_of[self._last]
             parts = [(self._last, value, ends), *((rows, worth, rows + 1) for rows in self._depths)]
@@ -341,7 +342,7 @@ class CallGraph:
 
 
 def are_apart(goals: int, calls: int) -> bool:
-    """Return whether each of so many goals of calls is as another skill would be."""
+    """Return whether a skill's goals are few enough for each to be an option of its own."""
     return goals <= MOST_APART and 2 * goals <= calls
 
 

@@ -341,7 +341,7 @@ class Chain:
     calls: tuple[int, ...]
     """The number of calls that each factor was counted from."""
     interval: tuple[float, float]
-    """Of the estimate, 95 %, by the episodes whose calls count at the scarcest step."""
+    """The 95 % interval of the estimate, by the episodes whose calls count at the scarcest step."""
 
     def __str__(self) -> str:
         """Return the estimate and the product as a sentence."""
@@ -548,7 +548,7 @@ class Blame:
         place: the number of the flat observation that the first skill changes and in which these
             ends differ most; None: there is none, or images.
         means: its mean at the best ends, and at the others.
-        reasons: how the calls that failed ended: own, limit, interrupted, episode.
+        reasons: the ends of the calls that failed: own, limit, interrupted, episode.
         first: True if other ends of the first skill would do, so that it is to blame.
         works: where the second skill is clearly more often done: the skill before ("start": none),
             its calls that are done there, and all.
@@ -661,6 +661,7 @@ class Blame:
         return f"{text}, {between}, or {self.after!r} has to end where {self.skill!r} works"
 
     def _difference(self) -> str:
+        """Return words on the number that differs most between the starts of calls."""
         if self.place is None:
             return ""
         one, other = (f"{mean:.2g}" for mean in self.means)

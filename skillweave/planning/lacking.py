@@ -116,7 +116,7 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
 
 
 def asks_nothing(task: RewardMachine, log: CallColumns) -> str:
-    """Return which words of a task hold before anything is done, in a sentence; empty: it asks.
+    """Return a sentence on words of a task that hold before anything is done; empty: none does.
 
     A task asks for nothing if most logged episodes do it in the fewest steps in which it can be
     done, whatever skill acts. An event that holds in nearly all logged steps asks for nothing
@@ -198,6 +198,7 @@ def names_of(arrows: Iterable[Arrow]) -> str:
 
 
 def _sentence(missing: Sequence[Predicate], log: CallColumns) -> str:
+    """Return a sentence on predicates that hold in no step of a log."""
     names = " and ".join(repr(p.name) for p in missing[:3])
     verb = "holds" if len(missing) == 1 else "hold"
     text = f"{names} never {verb} in the {log.steps:,} steps of the log, so no plan leads there"

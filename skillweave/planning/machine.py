@@ -425,6 +425,7 @@ def _skills_of(arrow: Arrow, skills: Mapping[str, Any]) -> list[str]:
 
 
 def _checked_reward(reward: Any, where: str) -> Reward:
+    """Return a reward of a machine's transition or state, checked."""
     number = isinstance(reward, int | float | np.integer | np.floating)
     if number and not isinstance(reward, bool) and abs(reward) <= LARGEST_REWARD:
         return float(reward)
@@ -438,6 +439,7 @@ def _checked_reward(reward: Any, where: str) -> Reward:
 
 
 def _each_step(value: Any, named: Mapping[str, int]) -> dict[int, Reward]:
+    """Return the rewards of each step by the machine's state; one reward is for all states."""
     where = "RewardMachine: each_step"
     if isinstance(value, Mapping):
         return {_number(k, named, "each_step"): _checked_reward(v, where) for k, v in value.items()}
@@ -446,6 +448,7 @@ def _each_step(value: Any, named: Mapping[str, int]) -> dict[int, Reward]:
 
 
 def _states(value: Any, what: str) -> list[Any]:
+    """Return the states in a set that a machine is given, checked."""
     if isinstance(value, str) or not isinstance(value, Collection):
         raise DeclarationError(
             f"RewardMachine: {what} is {short(value)}; give a set of states: {what}={{'done'}}"
@@ -454,6 +457,7 @@ def _states(value: Any, what: str) -> list[Any]:
 
 
 def _number(name: Any, named: Mapping[str, int], what: str) -> int:
+    """Return the number of a machine's state by its name."""
     if name not in named:
         raise DeclarationError(
             f"RewardMachine: {what} names the state {short(name)}, which no transition names; the "

@@ -110,7 +110,7 @@ class Mission(RewardMachine):
         legs: predicates, functions of observations or of a ``Step``, ``held(...)``,
             ``either(...)``, ``in_any_order(...)``, other missions, or lists of these (sequences).
         avoid: predicates; where one holds before the mission is done, it has failed.
-        repeat: how many times the legs are done; None: again and again, without an end.
+        repeat: the number of times that the legs are done; None: again and again, without an end.
 
     Raises:
         DeclarationError: it has no legs, a leg has a wrong type, or two legs in succession are the
@@ -189,6 +189,7 @@ def _needed(part: Part) -> Iterator[Predicate]:
 
 
 def _several(parts: Sequence[Any], where: str) -> tuple[Part, ...]:
+    """Return the parts of a choice, or of one in any order, checked."""
     if not 2 <= len(parts) <= MOST_TOGETHER:
         raise DeclarationError(
             f"{where} has {len(parts)} part{'' if len(parts) == 1 else 's'}; give 2 to "
@@ -312,6 +313,7 @@ def _unique(waits: Sequence[str]) -> tuple[str, ...]:
 
 
 def _fragment(part: Part) -> _Fragment:
+    """Return the machine of a part of a mission."""
     if isinstance(part, InOrder):
         # A part that is repeated is one object, and has one fragment.
         fragments = {id(p): _fragment(p) for p in {id(p): p for p in part.parts}.values()}
@@ -463,6 +465,8 @@ _TOKEN = re.compile(r"\s*(?:(?P<word>[^\W\d][\w-]*)|(?P<number>\d+)|(?P<sign>[()
 
 
 class _Token(NamedTuple):
+    """A word, number or sign of a mission's text, with its place."""
+
     kind: str
     """``word``, ``number``, ``sign`` or ``end``."""
     text: str
@@ -470,6 +474,8 @@ class _Token(NamedTuple):
 
 
 class _Parser:
+    """A parser of a mission's text."""
+
     def __init__(self, text: str, predicates: Mapping[str, Event]) -> None:
         self.text = fitted(str, text, "a mission")
         self.predicates = predicates
@@ -610,6 +616,7 @@ class _Parser:
             self.fail(f"{wanted} is expected here")
 
     def number(self, least: int, most: int) -> int:
+        """Parse a whole number from ``least`` to ``most``."""
         token = self.take()
         if token.kind != "number":
             self.fail("a whole number is expected here", token)
@@ -630,6 +637,7 @@ class _Parser:
         raise DeclarationError(f"mission: {reason}\n  {line}\n  {pointer}")
 
     def _tokens(self) -> list[_Token]:
+        """Return the tokens of the mission's text."""
         tokens: list[_Token] = []
         place = 0
         end = len(self.text.rstrip())

@@ -130,7 +130,7 @@ class FeatureMap:
 
     @property
     def acting(self) -> plan.Features:
-        """The same for a plan that acts: a feature far beyond the log is named once."""
+        """The features for a plan that acts: one far beyond the log is named once."""
         function: Callable[..., Any] = self.raw
         if self._codec is None:
             function = Wrapped(self._features, self.raw)
@@ -177,6 +177,7 @@ class FeatureMap:
         return value
 
     def _checked_places(self, places: Any, size: int) -> list[int]:
+        """Return places of features in the flat observation, checked; None: all."""
         if places is None:
             return list(range(size))
         whole = [p for p in places if isinstance(p, int | np.integer) and 0 <= p < size]
@@ -209,7 +210,7 @@ def nearest(points: Array, to: Array, count: int, group: Array) -> tuple[Array, 
     Args:
         points: (m, F) float32.
         to: (n, F) float32.
-        count: how many.
+        count: the number of points.
         group: (m,) the group of each point; of a group only the nearest point counts.
 
     Returns:

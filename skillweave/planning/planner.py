@@ -157,7 +157,7 @@ class Planner(ReadySelector):
         self.obstacle = ""
         """Why no order of logged steps does the task; empty: one does, or it has no end."""
         self.already = asks_nothing(self.machine, log)
-        """Which words of the task hold before anything is done; empty: it asks for something."""
+        """A sentence on words of the task that hold before anything is done; empty: none does."""
         if isinstance(self.task, RewardMachine):
             self.plan = self._solve(self.task)
             self.obstacle = obstacle(self.task, log)
@@ -289,7 +289,7 @@ class Planner(ReadySelector):
         """Draw logged observations, and states of the task that is not over in them.
 
         Args:
-            count: how many at most.
+            count: the most observations.
             goals: the most goals that they have, where observations hold goals.
             rng: the source of chance.
 

@@ -215,14 +215,14 @@ def successes(skills: Iterable[Skill]) -> dict[str, Predicate]:
 
 
 def _of(join: Callable[..., Array], name: str, *parts: Predicate) -> Predicate:
-    """Return the predicate that joins what the ``parts`` answer."""
+    """Return the predicate that joins the answers of its parts."""
     reads: Reads = "obs" if all(part.reads == "obs" for part in parts) else "step"
     ask = Predicate.at if reads == "obs" else Predicate.holds
     return Predicate(lambda x: join(*(ask(part, x) for part in parts)), name, reads)
 
 
 def _hint(error: SkillError) -> str | None:
-    """Return what a function that failed on observations has perhaps mistaken them for."""
+    """Return advice for a function that took observations for a ``Step``, or None."""
     cause = error.__cause__
     fields = {field.name for field in dataclasses.fields(Step)}
     if isinstance(cause, AttributeError) and cause.name in fields:
@@ -234,7 +234,7 @@ def _hint(error: SkillError) -> str | None:
 
 
 def _argument(function: Callable[[Any], Any]) -> Reads:
-    """Return what a function reads, by the name or annotation of its first argument."""
+    """Return the input of a function, steps or observations, by its first argument."""
     try:
         first = next(iter(inspect.signature(function).parameters.values()), None)
     except (TypeError, ValueError):

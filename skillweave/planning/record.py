@@ -196,6 +196,7 @@ class WithDrawnGoals(Around):
 
 
 def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
+    """Return the acting selector that ``choose`` means, for the skills in an engine."""
     names = tuple(s.name for s in skills.skills)
     choices = skills.choice_space
     if isinstance(choose, Explorer):

@@ -47,7 +47,7 @@ STEPS = {"next_obs": "next_obs", "action": "env_action", "reward": "env_reward"}
 MOST_BYTES = 4 * 2**30
 """The largest log."""
 CALL = ("skill", "elapsed", "end", "length")
-"""What a recorder reads of a player's memory."""
+"""Fields of a hierarchy's memory that a recorder reads."""
 FED_ROWS = 64
 """The most steps of a trace that is fed step by step."""
 FED_BYTES = 2**25
@@ -126,7 +126,7 @@ class Recorder:
         self.endless = np.array([is_endless(skills, i) for i in range(len(skills.skills))], bool)
         """(S,) bool, with ``own_rewards`` their ``success`` is asked in each step, for ``late``."""
         self.limits = tuple(skills.limit(i) for i in range(len(skills.skills)))
-        """Of each skill, the most steps of a call; None: it has no limit."""
+        """The most steps of a call, by skill; None: it has no limit."""
         self.steps = 0
         """Steps that are kept."""
         self._bytes = 0  # of all steps so far
@@ -154,14 +154,14 @@ class Recorder:
 
     @property
     def reads_infos(self) -> bool:
-        """It reads the ``info`` of steps."""
+        """True if the recorder reads the ``info`` of steps."""
         methods = ("success", "reward") if self._own_rewards else ("success",)
         return bool(self.info) or any(
             skill.defines(method) for skill in self.skills.skills for method in methods
         )
 
     def add(self, trace: Batch, ids: Array | None = None) -> None:
-        """Read the next steps.
+        """Read the next steps of a trace.
 
         Args:
             trace: a ``Trace`` (T, k); or a batch of its columns, with ``call_succeeded`` and those
@@ -401,7 +401,7 @@ class TraceFeed:
         self._out: TraceWriter | None = None
 
     def add(self, ids: Array, step: Step, levels: Mapping[str, Memory]) -> None:
-        """Add a step of environments ``ids`` (k,), ascending.
+        """Add a played step of environments ``ids`` (k,), ascending.
 
         Args:
             step: of these environments; ``elapsed`` counts the steps of the episode.
@@ -436,7 +436,7 @@ class TraceFeed:
 
 
 def calls_in(memory: Any, goals: Mapping[int, tuple[str, Goals]], rows: Array) -> Memory:
-    """Return what a ``TraceFeed`` takes of a hierarchy's memory.
+    """Return the fields of a hierarchy's memory that a ``TraceFeed`` reads.
 
     These are ``skill``, ``elapsed``, ``end`` and perhaps ``length``, (k,) each, and the goals of
     skills that have some, (k, *goal_shape).

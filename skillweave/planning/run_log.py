@@ -155,7 +155,7 @@ def next_seed(log: CallLog | None) -> int:
 
 
 def _identities(log: CallLog) -> list[tuple[int, int] | None]:
-    """Return of each call its episode's seed, and a checksum of the choices until its end.
+    """Return the identity of each call: its episode's seed, and a checksum of choices so far.
 
     Two calls with the same are the same, as environments repeat themselves; None: unknown.
     """
@@ -174,7 +174,7 @@ def _identities(log: CallLog) -> list[tuple[int, int] | None]:
 
 
 def _bounded(log: CallLog) -> CallLog:
-    """Return the latest calls that fit into the file."""
+    """Return the latest calls of a log, as many as fit into a run's file."""
     each = max(1, sum(column.nbytes for column in columns_of(log).values()) // max(1, log.steps))
     most = min(MOST_STEPS, MOST_BYTES // each)
     if log.steps <= most:

@@ -30,7 +30,7 @@ class Deployed:
 
 
 class Actor:
-    """Acts in one environment, and keeps the policy's memory.
+    """A policy in one environment, with its memory.
 
     Args:
         deployed: the policy.

@@ -19,7 +19,7 @@ Memory: TypeAlias = dict[str, Any]
 
 
 class CallEnd(IntEnum):
-    """Why a call ended."""
+    """Reason why a call ended."""
 
     RUNNING = 0
     """It has not ended."""
@@ -34,7 +34,7 @@ class CallEnd(IntEnum):
 
 
 RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = map(int, CallEnd)
-"""The same as plain integers, with which arrays are compared six times as fast."""
+"""``CallEnd`` as plain integers, with which arrays are compared six times as fast."""
 
 
 def end_with_episode(end: Array, over: Array) -> None:
@@ -99,7 +99,7 @@ def part_of(
     max_steps: int | None = None,
     goal: Array | None = None,
 ) -> Step:
-    """Return a step as seen by someone with a time of its own.
+    """Return a step as a skill sees it, which counts its own steps and has its own limit.
 
     Args:
         elapsed: (m,) steps so far, this one included.
@@ -191,7 +191,7 @@ class World:
     overridden: Array | None = None
     """(N,) bool, set where a reflex acts."""
     trace: Any = None
-    """Where those who learn write what they choose, ``write(rows, **columns)``; None: nowhere."""
+    """Writer of learning policies' columns, ``write(rows, **columns)``; None: none is kept."""
 
 
 @dataclass(slots=True)
@@ -242,7 +242,7 @@ class Choices:
 
 
 class RowPolicy:
-    """Acts in some of N environments; the base of all that do, for those that remember nothing."""
+    """A policy in some of N environments; the base of all, complete for those without memory."""
 
     watches = False
     """``observe`` has something to notice."""
@@ -277,7 +277,7 @@ class RowPolicy:
         return False
 
     def redraws(self, greedy: bool) -> bool:
-        """Return whether it may choose otherwise where it is asked the same again."""
+        """Return whether it may choose otherwise for the same observations."""
         return not greedy
 
     def check(self, sees: Any, acts: Any, goal: Any, where: str) -> None:
@@ -313,7 +313,7 @@ class Around(RowPolicy):
 
 
 def innermost(policy: RowPolicy) -> RowPolicy:
-    """Return the policy that combinators stand around."""
+    """Return the policy inside of all combinators."""
     while isinstance(policy, Around):
         policy = policy.policy
     return policy

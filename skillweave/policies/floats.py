@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 _PROGRAM: ContextVar[dict[str, Any] | None] = ContextVar("_PROGRAM", default=None)
-"""What the program has set, while the library computes otherwise; None: it has set nothing."""
+"""The program's own ``numpy.seterr``, where the library has replaced it; None: it has not."""
 
 
 @contextmanager

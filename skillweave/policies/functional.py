@@ -86,7 +86,7 @@ class Functional:
 
     @property
     def is_plain(self) -> bool:
-        """It acts as ``in_place`` does: no subclass has another way."""
+        """True if no subclass changes ``start``, ``act`` or ``observe``: ``in_place`` may act."""
         kind = type(self)
         own = (kind.start, kind.act, kind.observe)
         return own == (Functional.start, Functional.act, Functional.observe)

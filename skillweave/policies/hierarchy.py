@@ -61,7 +61,7 @@ class CallGoals:
     """The goals of a skill's calls."""
 
     name: str
-    """Of the skill, for messages."""
+    """The skill's name, for messages."""
     space: Space
     clip: Callable[..., Any] | None = code(
         "observations and goals (n, ...) to goals (n, ...)", "clip_goal", needed=False
@@ -131,7 +131,7 @@ class CalledSkill:
     limit: int | None = None
     """Steps after which a call is cut; None: never."""
     max_steps: int | None = None
-    """Of these the skill's own: its functions see that it is ``timed_out``."""
+    """The skill's own limit of these two: its functions see that it is ``timed_out``."""
     initiation: Callable[..., Any] | None = code(
         "observations (n, ...) to (n,) bool", "initiation", needed=False
     )
@@ -163,13 +163,13 @@ class Critic:
 
 @dataclass(eq=False)
 class Interruption:
-    """When the selector ends a call (Sutton, Precup & Singh 1999, sec. 4)."""
+    """A rule by which the selector ends a call (Sutton, Precup & Singh 1999, sec. 4)."""
 
     worth: Critic | Callable[[Array], Array]
     """From observations (n, …), the value of each skill and last of a new decision, (n, S + 1), in
     deviations of the return."""
     margin: float
-    """How much more a new decision must be worth, in the same unit."""
+    """The gain in value at which a new decision ends a call, in the same unit."""
     critic: Any = field(default=None, metadata={"written": False})
     """The trained critic, if there is one."""
 
@@ -200,7 +200,7 @@ class CallAndReturn(Choices, RowPolicy):
     Args:
         selector: chooses; None: the caller does, by ``begin``.
         skills: in order.
-        lengths: that are chosen from together with skills; (): none is chosen.
+        lengths: the lengths that are chosen together with skills; (): none is chosen.
         guide: with a ``Selector``: restricts the choices, or only tells what it would choose.
         interruption: when the selector cuts a call; None: never.
         fresh_calls: it is a skill that has goals: selector and guide see them beside observations,

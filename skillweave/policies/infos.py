@@ -22,7 +22,7 @@ class Infos(dict[str, Any]):
     ``in``, ``get`` and iteration see only what the environments give in this step.
 
     Args:
-        info: what they give.
+        info: the batched values of this step, without missing ones.
         keys: those that they have given so far.
         n: their number.
     """

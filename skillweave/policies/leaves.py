@@ -27,7 +27,7 @@ class Selector(RowPolicy):
     """The number of its choices: skills, perhaps each with some lengths."""
 
     def chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
-        """Return how likely each of the choices that ``may`` be made is, (k, choices) float32.
+        """Return the probabilities of the choices that ``may`` be made, (k, choices) float32.
 
         Where it chooses no lengths, all lengths of a skill are equally likely.
         """
@@ -37,11 +37,11 @@ class Selector(RowPolicy):
         return found
 
     def _chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
-        """Return how likely each of its own choices is, (k, count) float32."""
+        """Return the probabilities of its own choices, (k, count) float32."""
         raise NotImplementedError
 
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
-        """Return which choices (k, choices) it leaves, as far as is known before it sees more."""
+        """Return the choices (k, choices) that it leaves, as far as known before it sees more."""
         allowed = self.allowed(memory, rows)
         if allowed is None:
             return may
@@ -133,7 +133,7 @@ class OnnxNetwork(RowPolicy):
     file: bytes
     sees: Space
     acts: Space
-    """Of its actions; where it has parts, the file gives them as rows, ``Space.flat``."""
+    """The space of its actions; where it has parts, the file gives them as rows, ``Space.flat``."""
     choices: int = 0
     """The width of its mask; 0: it takes none."""
     memory: int = 0

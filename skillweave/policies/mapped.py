@@ -19,7 +19,7 @@ from .spaces import Space, at, discrete
 Shapes = Mapping[str, tuple[int | None, ...] | None]
 """Shapes of a model's inputs for one environment, by name; None: unknown."""
 HERE = {"written": False}
-"""Of fields that say where something is, for messages: who reads a file knows it."""
+"""Metadata of fields that serve messages; files do not contain them."""
 LONGEST = 100_000
 """The most steps of an action, and the most actions of an inference: all are remembered."""
 NUMBERS: dict[str, type[np.generic]] = {
@@ -49,14 +49,14 @@ class Take:
 
     source: Literal["observation", "goal", "last_action", "function"]
     shape: tuple[int, ...]
-    """Of one environment: of the leaf, of the goal, of the last output, or of what the function
-    makes."""
+    """The shape for one environment, of the leaf, the goal, the last output, or the function's
+    result."""
     fields: tuple[str, ...] = ()
     """The names that lead to a leaf of the observation."""
     places: tuple[int, ...] | None = None
-    """Of the flat leaf, choices one-hot; None: all."""
+    """Indices into the flat leaf, choices one-hot; None: all."""
     choices: tuple[tuple[int, int], ...] = ()
-    """Of a leaf that becomes one-hot, the number of options of each choice, and its first one."""
+    """The number of options of each choice and its first one, where a leaf becomes one-hot."""
     whole: bool = False
     """It keeps its shape."""
     function: Callable[..., Any] | None = code(
@@ -189,9 +189,9 @@ class Input:
 
     takes: tuple[Take, ...]
     shape: tuple[int, ...]
-    """Of one environment."""
+    """The shape of the input for one environment."""
     scalings: tuple[Affine, ...] = ()
-    """In their order."""
+    """Scalings of the input, applied in this order."""
     reshaped: bool = False
     """It is brought to its shape: one number with or without an axis of its own."""
 
@@ -451,7 +451,7 @@ class Function(Model):
     single_state: bool = False
     """It takes and returns one array as its state, not a tuple."""
     takes_goal: Literal["", "goal", "second"] = ""
-    """How it takes the goal of a call: by the name goal, or as its second argument."""
+    """The argument that takes the goal of a call: named goal, or the second; "": none."""
     who: str = field(default="the policy", metadata=HERE)
     """Begins messages."""
 
@@ -564,11 +564,11 @@ class OnnxFile(Model):
     inputs: tuple[str, ...]
     """The names of its inputs, without those of its state."""
     state: tuple[tuple[str, str], ...] = ()
-    """Of its recurrent state the name of each input, and of the output that is its next value."""
+    """Names of the recurrent state: of each input, and of the output that is its next value."""
     who: str = field(default="the policy", metadata=HERE)
     """Begins messages."""
     session: Any = field(default=None, repr=False, metadata={"written": False})
-    """Of onnxruntime; None: it is opened when it is needed."""
+    """The session of onnxruntime; None: it is opened when it is needed."""
 
     def __post_init__(self) -> None:
         if not self.inputs:
@@ -711,7 +711,7 @@ class Mapped(RowPolicy):
     )
     """(G,) or a function: the goal, where the call that it acts in has none."""
     goal_space: Space | None = None
-    """Of the goals of calls; None: such a goal is numbers (n, G)."""
+    """The space of the goals of calls; None: such a goal is numbers (n, G)."""
     who: str = field(default="the policy", metadata=HERE)
     """Begins messages."""
     warn: Callable[[str], None] | None = field(default=None, repr=False, metadata=HERE)
@@ -732,7 +732,7 @@ class Mapped(RowPolicy):
                 f"{self.who}: chunk needs actions of one array, but they are of {str(space)[:300]}"
             )
         self.takes = [take for one in (self.inputs or {}).values() for take in one.takes]
-        """What its inputs are joined of."""
+        """Sources that the inputs are made of."""
         goals, last = (
             {take.shape for take in self.takes if take.source == source}
             for source in ("goal", "last_action")

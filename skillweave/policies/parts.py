@@ -75,7 +75,7 @@ class Correction:
     step: Array
     """(…) the largest correction of each number."""
     space: Space
-    """Of what comes of it."""
+    """The space of the corrected actions."""
 
     def apply(self, base: Array, learnt: Array) -> Array:
         """Return actions (n, …) of those of the ready policy and of what was learnt, (n, …)."""
@@ -99,7 +99,7 @@ class Corrects(Around):
         return {"own": self.policy.start(n), "base": self.base.start(n)}
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
-        """Return corrected actions; what is corrected is greedy, and no mask counts for it."""
+        """Return corrected actions; the base policy acts greedily, and without a mask."""
         own = self.policy.act(memory["own"], rows, obs, turn)
         alone = Turn(World(turn.world.rng), None, turn.goal)
         return self.correction.apply(self.base.act(memory["base"], rows, obs, alone), own)
@@ -136,21 +136,21 @@ class Slice:
     """
 
     space: Space
-    """Of whole actions."""
+    """The space of the environment's actions."""
     own: Space
-    """Of its own actions."""
+    """The space of the skill's own actions."""
     inputs: dict[str, Input] | None = None
-    """What it sees, by name; "": alone. None: all."""
+    """The inputs of the skill's policy, by name; "": alone. None: the whole observation."""
     sees: Space | None = None
-    """Of what it sees, where it has ``inputs``."""
+    """The space of the skill's own observations, where it has ``inputs``."""
     axes: int = 0
     """The number of axes of an observation of the environment."""
     places: tuple[int, ...] | None = None
-    """What it writes: the places of its numbers in the flat action; of one choice, the number,
-    from 0, of each option that is its own."""
+    """Indices of the skill's numbers in the flat action; of one choice, the number, from 0, of each
+    option that is its own."""
     paths: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = ()
-    """What it writes of an action with parts: the names that lead to a leaf in it, and in its own
-    action. Without these and ``places`` it writes all."""
+    """Leaves of an action with parts that the skill writes: the names that lead to each in the
+    action, and in its own one. Without these and ``places`` it writes all."""
     fixed: Array | None = None
     """(1, …) the action where it writes nothing; None: nothing is left."""
     held: tuple[tuple[tuple[str, ...], Array], ...] = ()
@@ -219,7 +219,7 @@ class Slice:
         return bool(self.held)
 
     def see(self, obs: Array) -> Array:
-        """Return what its policy sees of observations (…, *obs_shape), without a goal."""
+        """Return the skill's own observations, of those of the environment (…, *obs_shape)."""
         obs = obs if self.view is None else self.view(obs)
         space = self.sees
         if self.inputs is None or space is None:
@@ -394,7 +394,7 @@ class Viewed(Around):
             self.policy.observe(memory, rows, self.seen(step))
 
     def seen(self, step: Step) -> Step:
-        """Return what the policy sees of a step."""
+        """Return a step with the observations that the policy sees."""
         return replace(step, obs=self.view(step.obs), next_obs=self.view(step.next_obs))
 
 
@@ -425,7 +425,7 @@ class Reflexes(Around):
 
     reflexes: tuple[Override, ...]
     space: Space
-    """Of the actions."""
+    """The space of the actions."""
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return the policy's actions, or those of a reflex."""
@@ -483,7 +483,7 @@ class Remembers(Around):
     """The outermost policy where the last action counts for a skill: it is remembered for all."""
 
     space: Space
-    """Of the actions; its ``start`` stands for the last ones where an episode starts."""
+    """The space of the actions; its ``start`` stands for the last ones where an episode starts."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

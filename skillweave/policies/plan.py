@@ -65,7 +65,7 @@ def check(
 
 @dataclass(eq=False)
 class Features:
-    """By what the calls of a skill are compared: standardised numbers of observations."""
+    """Standardised numbers of observations, by which the calls of a skill are compared."""
 
     places: Array
     """(F,) int64, which numbers of the flat observation, or of the function's answer."""
@@ -77,7 +77,7 @@ class Features:
         "observations (n, ...) to features (n, F)", "features", needed=False
     )
     look: Callable[[Array], None] | None = field(default=None, metadata={"written": False})
-    """Of raw numbers (n, R), which may be refused."""
+    """A function that checks raw numbers (n, R), and may refuse them; None: no check."""
 
     def __post_init__(self) -> None:
         check("places", self.places, "iu", (None,), 0)
@@ -121,7 +121,7 @@ class OptionGroup:
 
     choice: int
     options: int
-    """How many; of several, each has the goal of one of the nearest calls."""
+    """The number of options; of several, each has the goal of one of the nearest calls."""
     rows: Array
     """(m,) int64, the pieces of their calls; of equally near ones the first count."""
     starts: Array
@@ -151,7 +151,7 @@ class OptionGroup:
         """Return the nearest pieces to features ``to`` (n, F), however far they are.
 
         Args:
-            k: how many, each of another call.
+            k: the number of pieces, each of another call.
             aims: (C, G) float32, the standardised goals of all calls; None: it has no goals.
             without: (n,) calls whose pieces do not count; None: all count.
 
@@ -200,11 +200,11 @@ class Options:
 
     groups: tuple[OptionGroup, ...]
     aims: tuple[Array | None, ...]
-    """Of each skill, (C, G) float32, the standardised goals of all calls; None: it has none."""
+    """The standardised goals of all calls, (C, G) float32, by skill; None: it has no goals."""
     neighbors: int
     """K."""
     lengths: tuple[int, ...] = ()
-    """That are chosen with a skill; (): none."""
+    """Lengths of calls that are chosen with a skill; (): none."""
 
     def __post_init__(self) -> None:
         each = max(1, len(self.lengths))

@@ -39,7 +39,7 @@ class Planned(Rule):
     """
 
     features: tuple[Features, ...]
-    """Of each skill."""
+    """The features of each skill's calls."""
     options: Options
     task: Machine
     levels: Levels
@@ -224,7 +224,7 @@ class Planned(Rule):
         yield slice(None), self.worth
 
     def valued(self, near: Near, obs: Array, corners: tuple[Array, Array]) -> Array:
-        """Return what the log says of each option, (n, O) float32; −infinity: it has no call.
+        """Return the value of each option by the log, (n, O) float32; −infinity: it has no call.
 
         Args:
             near: the nearest pieces to observations ``obs`` (n, …).
@@ -294,7 +294,7 @@ class Planned(Rule):
         """Return values (k, O) for which the episode's own calls count as logged ones.
 
         Args:
-            now: what the log says in the present.
+            now: the worth by the log in the present state.
         """
         corrected = now["q"].copy()
         names: tuple[str, ...] = ("choice", "start", "from", "goal")

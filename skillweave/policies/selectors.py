@@ -49,7 +49,7 @@ class Rule(Selector):
     """The goals of the skills that have some, by name."""
 
     advice = "write ({0!r}, goal) in place of {0!r}"
-    """How a goal is given to a skill, for messages."""
+    """Advice on giving a goal to a skill, for messages."""
 
     def __post_init__(self) -> None:
         if not self.skills or len(set(self.skills)) < len(self.skills):
@@ -310,7 +310,7 @@ class StateMachine(Rule):
     """
 
     states: dict[str, tuple[str, ...]]
-    """By name of the state, its skills, the best first."""
+    """The skills of each state, the best first, by the state's name."""
     first: str
     """The state in which episodes start."""
     transitions: tuple[tuple[str, str, str | Callable[..., Any]], ...] = code("a Step to (n,) bool")
@@ -444,7 +444,7 @@ class TreeCondition:
     """A condition in a tree: SUCCESS where it holds, else FAILURE."""
 
     name: str
-    """Of the function in messages."""
+    """The function's name in messages."""
     function: Callable[..., Any] = code("observations (n, ...) to (n,) bool")
 
 

@@ -48,7 +48,7 @@ class Space:
     high: Array | None = None
     """(*shape) or one for all: the highest numbers, or the last choices."""
     parts: dict[str, Space] | None = None
-    """Of a Dict or Tuple, in order."""
+    """The parts of a Dict or Tuple, in order; None: another space."""
 
     def __post_init__(self) -> None:
         if self.parts is not None or self.kind in ("Dict", "Tuple"):
@@ -306,7 +306,7 @@ class Space:
         Args:
             values: (n, *shape); of a Dict or Tuple also dicts and tuples of such arrays.
             who: whose goals they are, for messages.
-            skill: which is given them, for messages.
+            skill: the skill that gets them, for messages.
             rows: the environments (k,) whose goals are returned, (k, *shape); None: all. The goals
                 of the others may be anything.
 

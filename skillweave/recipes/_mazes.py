@@ -32,7 +32,7 @@ REACH = 0.45
 BALL = 0.1
 """The ball's radius in metres."""
 PIXELS = 32
-"""Of a metre in a picture."""
+"""Pixels of a metre in a picture."""
 WALL = (60, 66, 80)
 FLOOR = (235, 235, 230)
 GREEN = (120, 190, 130)

@@ -28,7 +28,7 @@ LEFT, RIGHT, HOVER, LAND = range(4)
 LEGS = 3
 """The most legs that a mission has."""
 POINTS = np.array([(-0.5, 0.75), (0.5, 0.75), (0.0, 0.6)])
-"""Where left, right and hover are: x and y as the lander sees them."""
+"""Places of left, right and hover: x and y as the lander sees them."""
 HALF = np.array([(0.15, 0.15), (0.15, 0.15), (0.2, 0.2)])
 """Half the width and height of the boxes around these points."""
 HOVER_STEPS = 100
@@ -36,7 +36,7 @@ HOVER_STEPS = 100
 PAD = 0.2
 """Half the width of the pad, as the lander sees it."""
 RESTED = 100.0
-"""What LunarLander pays in the step in which the lander has come to rest, and in no other."""
+"""Reward of LunarLander in the step in which the lander has come to rest, and in no other."""
 GUST_EVERY = 80
 """Steps from one gust to the next."""
 GUST_STEPS = 8

@@ -1,4 +1,4 @@
-"""What several recipes do with their environments and skills."""
+"""Functions that several recipes use for their environments and skills."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What people look at: progress, films, figures, and the report of a run in ``report``.
+"""Output for people: progress, films, figures, and the report of a run in ``report``.
 
 Begin with ``report/single``; ``report/facts`` has the facts that all of them print.
 """

@@ -22,7 +22,7 @@ class Row:
     share: float | None
     """The share that is done, from 0 to 1; None: it has no such share."""
     steps: str = ""
-    """The same in numbers."""
+    """The share in steps: done, and in all."""
     result: str = ""
     """Its result so far."""
     speed: str = ""

@@ -244,7 +244,7 @@ class EpisodeProgress:
             self._display = None
 
     def watch(self, played: Any) -> None:
-        """Count a step of some episodes (``Played``)."""
+        """Count a step of some episodes (``PlayedStep``)."""
         over = np.count_nonzero(played.over & (played.episode >= 0))
         self.count(int(played.lasted.sum()), int(over))
 

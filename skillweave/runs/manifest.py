@@ -221,7 +221,7 @@ class RepairEntry:
     rehearsal: str | None = None
     """Checksum of the file of its rehearsal's observations; None: without rehearsal."""
     later: Matrix | None = None
-    """The same after the repair; None: not measured yet."""
+    """The matrix after the repair; None: not measured yet."""
 
 
 @dataclass

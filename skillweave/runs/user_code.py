@@ -81,7 +81,7 @@ def notice_changes(then: Texts, now: Texts, since: str) -> None:
 
 
 def changes(then: Texts, now: Texts) -> str:
-    """Return what differs, as clauses; empty: nothing that both record."""
+    """Return the recorded differences of the user's code, as clauses; empty: there are none."""
     clauses = []
     for what, text in now.items():
         before = then.get(what)
@@ -105,7 +105,7 @@ def _text(thing: Any) -> str:
 
 
 def _maker(env: Any) -> Any:
-    """Return what makes an environment; of an id, what the user has registered."""
+    """Return the function that makes an environment; of an id, the registered one of the user."""
     entry = gym.registry.get(str(env).rpartition(":")[2])
     if entry is None:
         return env
@@ -122,7 +122,7 @@ def _form(x: Any, seen: dict[int, Any], owner: Any = None) -> Any:
     """Return a value as JSON; of what is neither plain nor code, the name of its class.
 
     Args:
-        seen: what was read already; it is read once.
+        seen: the values that were read already; each is read once.
         owner: the object whose method it is.
     """
     match x:

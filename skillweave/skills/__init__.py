@@ -1,4 +1,4 @@
-"""What users declare: skills, reflexes, ready selectors, and policies from elsewhere.
+"""Declarations of users: skills, reflexes, ready selectors, and policies from elsewhere.
 
 Begin with ``base``, the classes; ``skill_set`` makes policies of the skills below a selector.
 """

@@ -92,7 +92,7 @@ class _Reader:
         self.leaves = space_of(space).leaves
 
     def takes(self, source: Source, alone: bool, where: str) -> list[Take]:
-        """Return what a source takes.
+        """Return the numbers that a source takes of observations, as ``Take`` of each leaf.
 
         Args:
             alone: nothing else is in its input.
@@ -122,7 +122,7 @@ class _Reader:
         return [Take("function", shape, function=function, who=who)]
 
     def _reads(self, part: Part, alone: bool, where: str) -> list[Take]:
-        """Return what is taken of each leaf that a part reads, in the part's order."""
+        """Return a ``Take`` of each leaf that a part reads, in the part's order."""
         from skillweave.spaces.observations import image_layout
         from skillweave.spaces.packing import leaf_spaces
 
@@ -158,7 +158,7 @@ class _Reader:
         return found
 
     def _take(self, path: tuple[str, ...], part: Part, whole: bool = False) -> Take:
-        """Return what a part takes of a leaf, all of it; choices one-hot where it says so."""
+        """Return the ``Take`` of a whole leaf; choices are one-hot where the part says so."""
         leaf = self.leaves[path]
         choices: tuple[tuple[int, int], ...] = ()
         if part.one_hot and not whole and leaf.kind in ("Discrete", "MultiDiscrete"):

@@ -26,7 +26,7 @@ EXAMPLES = 16
 """The number of example observations on which a policy is tried out."""
 SEES = "let sees= give the parts that it takes"
 ACTS = "let acts= say what its outputs mean"
-"""What to do about a policy with other spaces, for messages."""
+"""Advice on a policy with other spaces, for messages."""
 
 
 class Foreign(Memoryless):
@@ -97,7 +97,7 @@ class Foreign(Memoryless):
 
     @property
     def given(self) -> str:
-        """Return what the policy is given, for messages."""
+        """Return the policy's input in words, for messages."""
         return f"observations of {short(self.observation_space, 300)}"
 
     def _advice_on(self, error: BaseException) -> str:

@@ -27,14 +27,14 @@ MOST_KEYS = 256
 DEPTH = 3
 """The most objects between a function and an attribute that it writes."""
 MODE: ContextVar[Literal["usual", "examples", "off"]] = ContextVar("MODE", default="usual")
-"""How functions are looked at: "examples" of observations are not what an environment gave."""
+"""Mode of the checks of functions; "examples": their observations are not an environment's."""
 
 Attributes = list[tuple[dict[str, Any], dict[str, Any]]]
 """The dicts of attributes of objects, and their values at one time."""
 
 
 class FunctionState:
-    """What a function may change: attributes of the user's objects, and random generators.
+    """The state that a function may change: attributes of the user's objects, and generators.
 
     Args:
         function: of the user; also an object.

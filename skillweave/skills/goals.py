@@ -67,7 +67,7 @@ class Goals(CallGoals):
         return call_user(self.skill.clip_goal, read_only(obs), who, more=(read_only(goals),))
 
     def join(self, obs: Array, goal: Array) -> Array:
-        """Return what the skill's networks see: one array (…) of observations and goals.
+        """Return the input of the skill's networks: one array (…) of observations and goals.
 
         Args:
             obs: (…, *obs_shape).

@@ -25,7 +25,7 @@ PLAIN_PPO = {"squash_actions": False, "action_std": "parameter"}
 
 
 def learn_on(skill: str) -> str:
-    """Return how a skill whose policy is given learns on, as a part of a sentence."""
+    """Return words on the way in which a skill with a ready policy can learn on."""
     return (
         "write policy = from_sb3(..., learn=True), or from_torch's, if it is a network from "
         "elsewhere; policy = Residual(policy) to learn a correction of its actions; if it is a "

@@ -203,7 +203,7 @@ class MappedPolicy(Functional, Foreign, Model):
         return f"; {SEES}" if whole else ""
 
     advice = "write Goal() at its place in sees"
-    """How the policy is given the goal, for messages."""
+    """Advice on giving the policy its goal, for messages."""
 
     def source(self) -> dict[str, Any]:
         """Return its source as JSON, with its mapping."""

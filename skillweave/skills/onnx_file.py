@@ -73,7 +73,7 @@ class OnnxPolicy(MappedPolicy):
 
     @property
     def model(self) -> OnnxFile:
-        """The file."""
+        """The acting model of the file."""
         how = self.mapping.state, self._who, self._session
         return OnnxFile(self.data, self.output, tuple(self.free), *how)
 

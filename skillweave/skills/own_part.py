@@ -217,11 +217,11 @@ def _shown(space: Data) -> str:
 
 
 Paths = tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]
-"""As of ``Part``."""
+"""A value of ``Slice.paths``."""
 
 
 def _written(acts: Any, space: Space[Any], who: str) -> tuple[Data, tuple[int, ...] | None, Paths]:
-    """Return the space of a skill's own actions, and its places or paths, as of ``Part``."""
+    """Return the space of a skill's own actions, and its places or paths, as of ``Slice``."""
     named = isinstance(acts, tuple) and isinstance(acts[0], str)
     data = space_of(space)
     if data.parts is not None and not named:
@@ -307,11 +307,11 @@ class OwnPart:
         self.whole_observation_space = observation_space
         self.whole_action_space = self.written_space = action_space
         self.observation_space = observation_space
-        """Of what its policy sees, without a goal."""
+        """The space of the skill's own observations, without a goal."""
         self.base: Policy | None = None
         """The ready policy to whose actions its own are added; None: there is none."""
         self.correction: Correction | None = None
-        """What adds them."""
+        """The correction that adds the skill's actions to those of the base policy."""
         how: dict[str, Any] = {}
         try:
             if sees is not None:
@@ -331,18 +331,18 @@ class OwnPart:
                 "of which nothing is left: leave out rest"
             )
         self.action_space: Space[Any] = self.written_space
-        """Of its own actions."""
+        """The space of the skill's own actions."""
         spaces = space_of(action_space), space_of(self.written_space)
         self.part = Slice(*spaces, axes=len(observation_space.shape or ()), who=who, **how)
-        """What acts."""
+        """The part that acts."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return what was declared as JSON."""
+        """Return the declaration of the part as JSON."""
         content = part_to_json(self._skill, self._rest, self.who)
         return content if self.base is None else content | {"policy": as_json(source_of(self.base))}
 
     def _fit_sees(self, sees: Any) -> dict[str, Any]:
-        """Return what it sees, as of ``Part``."""
+        """Return the fields ``inputs`` and ``sees`` of ``Slice``: the skill's own observations."""
         mapping = declared_sees(sees, self.who)
         inputs = fitted_inputs(mapping, self.whole_observation_space, self.who, {})
         spaces = {name: self._input_space(given) for name, given in inputs.items()}

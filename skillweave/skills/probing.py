@@ -89,7 +89,7 @@ def first_time(owner: Any, *what: str) -> bool:
 
 
 def _owner_and_name(function: Any) -> tuple[Any, str]:
-    """Return what the notes about a function stand under."""
+    """Return the object and the name under which the notes about a function are kept."""
     while isinstance(function, partial):
         function = function.func
     return getattr(function, "__self__", function), getattr(function, "__name__", "")

@@ -81,7 +81,7 @@ FILES = {
     ".pt": "from_torch({!r}, trust=True)",
     ".pt2": "from_torch({!r}, trust=True)",
 }
-"""How files act, by their suffix."""
+"""Calls that make a policy of a file, by its suffix."""
 
 
 PART = ", of which the skill has a part (sees, acts),"

@@ -115,7 +115,7 @@ def refuse_skill(value: Any, where: str) -> None:
 
 
 def correction(scale: Any, space: Space[Any], who: str) -> Correction:
-    """Return what adds to the actions of a ready policy, in a space, what is learnt in [−1, 1].
+    """Return the residual that adds learnt numbers in [−1, 1] to a ready policy's actions.
 
     Args:
         scale: as of ``Residual``.

@@ -433,7 +433,7 @@ def _opened(file: Path, trust: bool, model: Any) -> Any:
 
 
 def _other_version(content: bytes, here: str) -> str:
-    """Return what a file that could not be opened may be, for messages; ``here``: a version."""
+    """Return the likely reason why a file did not open; ``here``: the installed version."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             saved = archive.read("_stable_baselines3_version").decode("ascii", "replace").strip()

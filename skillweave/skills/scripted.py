@@ -78,7 +78,7 @@ class ScriptedPolicy(MappedPolicy):
         return super().source() | {"name": qualified(self.function)}
 
     def _ask(self, *given: Any, **named: Any) -> Any:
-        """Return what the function makes of its inputs, and perhaps of a goal or a state."""
+        """Return the function's result for its inputs, and perhaps for a goal or a state."""
         who = self._who
         mapping = self.mapping
         space = self.action_space
@@ -110,7 +110,7 @@ class _Alone(RowPolicy):
         self._function = function
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
-        """Return what the function returns."""
+        """Return the function's actions for observations."""
         action: Array = self._function(read_only(obs))
         return action
 

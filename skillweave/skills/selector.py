@@ -67,7 +67,7 @@ class ReadySelector(Functional, Foreign):
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what copies have: each makes its own rule."""
+        """Return the attributes of a copy, which makes its own rule."""
         made = ("in_place", "_like")
         return {name: value for name, value in vars(self).items() if name not in made}
 
@@ -97,7 +97,7 @@ class ReadySelector(Functional, Foreign):
 
     @property
     def _rule_of(self) -> tuple[str, tuple[str, ...], dict[str, Any]]:
-        """Return what every ``Rule`` is made of: who, skills and goals."""
+        """Return the arguments that every ``Rule`` has: who, skills and goals."""
         goals = {name: space_of(space) for name, space in self.goal_spaces.items()}
         return self._who, self.skills, goals
 

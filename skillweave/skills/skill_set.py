@@ -47,9 +47,9 @@ class SkillSet(LimitedCalls):
     """Skills act greedily; else they sample."""
 
     call_cost: float = 0.0
-    """What a selector that learns pays for each call, in units of reward."""
+    """Cost of each call for a selector that learns, in units of reward."""
     interruption: Interruption | None = None
-    """When the selector cuts a call; None: never."""
+    """Rule by which the selector cuts a call; None: it never does."""
     parts: tuple[OwnPart | None, ...] = ()
     """The own part of each skill's observations and actions, None: it has all; (): no skill has
     one."""
@@ -99,7 +99,7 @@ def acting_policy(
     *,
     outermost: bool = True,
 ) -> RowPolicy:
-    """Return skills in calls, with reflexes.
+    """Return the policy of a selector and its skills, which act in calls, with reflexes.
 
     Args:
         skills: with their policies; one that has skills and a selector itself is a hierarchy.
@@ -138,14 +138,14 @@ def acting_alone(skills: SkillSet, i: int) -> RowPolicy:
 
 
 def within(policy: RowPolicy) -> CallAndReturn:
-    """Return the hierarchy that reflexes and the like stand around."""
+    """Return the hierarchy inside of reflexes and other combinators."""
     inside = innermost(policy)
     assert isinstance(inside, CallAndReturn)
     return inside
 
 
 def in_place(policy: Any, who: str = "the policy's act()") -> RowPolicy:
-    """Return a policy of any form as one whose memory is changed in place; ``who`` for messages."""
+    """Return a policy of any form as a ``RowPolicy``; ``who`` is for messages."""
     if isinstance(policy, RowPolicy):
         return policy
     if isinstance(policy, Functional) and policy.is_plain:
@@ -241,7 +241,7 @@ ENDS = ("initiation", "termination", "success")
 
 
 def _check_memory(policy: RowPolicy) -> None:
-    """Raise a PolicyError where a checkpoint could not hold what a policy remembers."""
+    """Raise a PolicyError where a checkpoint could not hold a policy's memory."""
     if not isinstance(policy, Returns):
         return
     for name, value in policy.start(1).items():

@@ -54,7 +54,7 @@ VALUES = {
     "training_steps": "steps",
     "colour": "color",
 }
-"""The same for attributes that are not methods."""
+"""Attributes that are not methods, by names that people write for them."""
 
 
 def misspelt(skill: Any, base: type, known: Iterable[str]) -> Iterator[tuple[str, str]]:

@@ -61,7 +61,7 @@ class ChoiceCodec(JointCodec):
     """
 
     owners: tuple[tuple[int, int], ...] = ()
-    """Of each skill with goals the numbers that choose it."""
+    """Range of the numbers that choose each skill with goals."""
 
     @property
     def choices(self) -> int:
@@ -106,7 +106,7 @@ class NumberedChoiceCodec(ActionCodec):
     """A converter of choices whose goals are discrete: each skill with each goal has a number."""
 
     goals: tuple[tuple[str, ActionCodec, tuple[int, int]], ...] = ()
-    """Of each skill with goals: its name, their codec, and the numbers that choose it."""
+    """Name, codec of goals and range of numbers of each skill with goals."""
 
     @cached_property
     def table(self) -> Array:

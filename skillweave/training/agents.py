@@ -138,7 +138,7 @@ class Agents:
         return {relative(k, self.level): a for k, a in self.algorithms.items()}
 
     def _margins(self) -> dict[str, float]:
-        """Return the margins of interruption, by the paths of critics in the stage's level."""
+        """Return the margins of critics that end calls, by their paths in the stage's level."""
         together = self.together
         margins = {CRITIC: together.margin} if together and together.interrupt else {}
         for path, role in self.roles.items():
@@ -224,7 +224,7 @@ class Agents:
         return state
 
     def _report_lost_state(self, name: str) -> None:
-        """Report a deleted file of a state."""
+        """Report that an earlier stage's file with a learner's state is deleted."""
         latest = self._latest_stage(name)
         path = self.stage.run.file("states", name)
         trained = latest is not None and latest.evolution is None and not latest.undone
@@ -253,7 +253,7 @@ class Agents:
         return Reference(params, torch.ones(1, dtype=torch.float32, device=device), kl / rate)
 
     def _quota(self, name: str) -> int | None:
-        """Return the valid rows that a learner from rollouts waits for; None: as one alone does."""
+        """Return the rows that a rollout learner waits for beside others; None: its own default."""
         together = self.together
         config = self.algorithms[name].config
         if together is None or self.algorithms[name].store != "rollout":
@@ -370,7 +370,7 @@ class Agents:
             raise _Stopped
 
     def _saved(self, extra: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return all tensors of a checkpoint, ``extra`` included."""
+        """Return all tensors of a checkpoint: the learners' states, and ``extra``."""
         for name, state in self.states().items():
             extra = extra | prefixed(f"state.{name}", vars(state))
         return extra | self.best.tensors()

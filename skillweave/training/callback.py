@@ -82,6 +82,7 @@ class TrainCallback(Listener):
         steps: int,
         metrics: Mapping[str, float | None],
     ) -> None:
+        """Call the user's function with an event; stop the stage where it returns False."""
         stages = self._run.manifest.stages
         done = [s for s in stages if s.done]
         budget = self._run.stage(name).budget

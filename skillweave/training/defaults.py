@@ -17,7 +17,7 @@ InfoKeys = Annotated[
 AGENT_DEFAULTS = ("eval_every", "eval_episodes", "checkpoint_every", "keep", "log_info")
 """The arguments that ``TrainDefaults`` completes, and ``run.json`` records, of a plain agent."""
 HIERARCHY_DEFAULTS = (*AGENT_DEFAULTS, "log_calls", "log_calls_info")
-"""The same of a hierarchy."""
+"""The arguments that ``TrainDefaults`` completes, and ``run.json`` records, of a hierarchy."""
 
 
 @settings

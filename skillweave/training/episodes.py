@@ -37,7 +37,7 @@ class EpisodeTally:
 
     @property
     def absent(self) -> tuple[str, ...]:
-        """Logged keys without a number so far."""
+        """Keys of ``info`` to log for which no number has come so far."""
         return tuple(key for key in self.keys if key not in self.with_number)
 
     def add(self, other: EpisodeTally) -> None:
@@ -65,7 +65,7 @@ class Episodes:
     def extend(
         self, ended: Array, info_keys: frozenset[str] = frozenset(), longest: int = 0
     ) -> None:
-        """Add ended episodes.
+        """Add episodes that ended in collectors.
 
         Args:
             ended: (K, 4 + I), as ``Collected.episodes``; NaN: unknown.
@@ -123,7 +123,7 @@ class Tick:
 def to_numbers(
     metrics: dict[str, Any], update: int, *, skip_diverged: bool = False
 ) -> dict[str, float]:
-    """Return means over the members.
+    """Return an update's metrics as numbers: means over the members of a population.
 
     A value that is not finite raises a TrainingError; with ``skip_diverged`` it is left out of the
     mean instead, as the trainer of a population replaces its member.

@@ -65,16 +65,16 @@ SCORE_ALONE = 'evaluate(skill="go_to") scores a skill alone'
 
 @dataclass(frozen=True)
 class Details:
-    """What an evaluation knows beside its scores, and does not save; None: it has none."""
+    """Details of an evaluation beside its scores, which are not saved; None: it has none."""
 
     logs: dict[str, CallLog] | None = None
     """The calls of each level, by its path."""
     handovers: tuple[str, ...] = ()
     """Sentences on skills that seldom succeed after one other skill."""
     goals: Array | None = None
-    """Of a skill that acted alone: the goal of each episode, (episodes, …)."""
+    """The goal of each episode, (episodes, …), where a skill acted alone."""
     reached: Array | None = None
-    """Of a skill that acted alone: the success of each episode's call, (episodes,) bool."""
+    """The success of each episode's call, (episodes,) bool, where a skill acted alone."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Evaluation:
         return _known(self.details.reached, f"{missing}: {SCORE_ALONE}")
 
     def comparing(self, features: Any) -> Evaluation:
-        """Return the same, with logs whose calls are compared by a hierarchy's ``features``."""
+        """Return the evaluation with the ``features`` by which its logs compare calls."""
         logs = dict(self.details.logs or {})
         logs[""] = replaced(logs[""], features=features)
         return replaced(self, details=replaced(self.details, logs=logs))
@@ -239,7 +239,7 @@ class Evaluation:
         return f"<Evaluation: {self}>"
 
     def _repr_html_(self) -> str:
-        """Return the same as ``for_people``, for notebooks."""
+        """Return the text of ``for_people`` as HTML, for notebooks."""
         rows = [*map(cells_of, skill_rows(self.skills))]
         tables = [table(TITLES, rows)] if rows else []
         lines = [*reflex_lines(self.reflexes, sum(self.lengths)), *self._hints()]
@@ -398,7 +398,7 @@ def _describe(spec: EnvSpec) -> tuple[int | None, float | None, bool]:
 
 
 def _with_notice(moments: Iterator[PlayedStep], name: str, most: int) -> Iterator[PlayedStep]:
-    """Yield what is played; give a notice once where an episode seems never to end.
+    """Yield played steps; give a notice once where an episode seems never to end.
 
     Args:
         name: of the environment.
@@ -464,7 +464,7 @@ def _scored(
     threshold: float | None,
     calls: PlayedCalls,
 ) -> Evaluation:
-    """Play all episodes and return their scores."""
+    """Play all episodes of an evaluation, and return their scores."""
     returns = np.zeros(episodes)
     lengths = np.zeros(episodes, np.int64)
     cut = 0
@@ -544,7 +544,7 @@ K = TypeVar("K")
 
 
 def _known(value: K | None, missing: str) -> K:
-    """Return what an evaluation knows; where it is ``missing``, raise an error."""
+    """Return a detail of an evaluation; None raises an error with the text ``missing``."""
     if value is None:
         raise DeclarationError(missing)
     return value

@@ -37,7 +37,7 @@ def imitate(
     seeds: Seeds,
     with_goals: tuple[gym.Space[Any], Array] | None = None,
 ) -> AgentPolicy:
-    """Return a policy whose choices are as likely as given ones, by cross-entropy.
+    """Train a selector's network to choose by given probabilities (cross-entropy); return it.
 
     Args:
         config: settings of PPO; the network has no memory.

@@ -136,7 +136,7 @@ class JointLearner:
 
 
 def how_it_acted(name: str, rows: Batch) -> dict[str, Tensor]:
-    """Return a selector's mean steps of a call, or a skill's usage and reward.
+    """Return metrics of a learner's rows: a selector's call length, or a skill's usage and reward.
 
     Args:
         name: the path of the learner; a critic has no such metrics.

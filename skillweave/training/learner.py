@@ -190,7 +190,7 @@ def keep_to_guide(learner: RolloutLearner, target_kl: float | None) -> None:
 
 
 def adapted(coef: Tensor, kl: Tensor, target_kl: float) -> Tensor:
-    """Return the next cost of a nat of KL, so that KL approaches ``target_kl``; (P,) each.
+    """Return the next coefficient of the KL to a guide, so that KL nears ``target_kl``; (P,) each.
 
     The rule of the adaptive penalty of Schulman et al. 2017, sec. 4.
     """
@@ -207,5 +207,5 @@ def member_seeds(seeds: Seeds, name: str, members: int, update: int, first: int 
 
 
 def crossed(every: int, before: int, after: int) -> bool:
-    """Return True if a multiple of ``every`` is above ``before``, up to ``after``."""
+    """Return True if a task due every ``every`` steps is due in (``before``, ``after``]."""
     return after // every > before // every

@@ -1,4 +1,4 @@
-"""What is learnt in a stage: who learns and who acts, with their environments and collectors."""
+"""The learning task of a stage: its learner and acting policies, environments and collectors."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from skillweave.training.role import Role
 
 @dataclass(frozen=True)
 class LearningTask:
-    """What is learnt in a stage, and who acts in its environments."""
+    """The learning task of a stage, and the policies that act in its environments."""
 
     role: Role
-    """Who learns; of a hierarchy that learns together, its selector."""
+    """The role that learns; of a hierarchy that learns together, its selector."""
     who: Alone | Calling
-    """Who acts; a guide may decide in the selector's place."""
+    """The acting policies; a guide may decide in the selector's place."""
     roles: Mapping[str, Role] | None = None
     """The roles of a level that learns together, and of those below it, by path; None: one learns
     alone."""
@@ -34,7 +34,7 @@ class LearningTask:
 
     @property
     def skills(self) -> SkillSet | None:
-        """The skills of the outermost hierarchy, where its calls are learnt; else None."""
+        """The skills called in the outermost hierarchy; None: it is the task of another learner."""
         who = self.who
         return who.skills if isinstance(who, Calling) and who.skill is None else None
 
@@ -63,7 +63,7 @@ def skill_task(
     """Return the learning task of a skill's stage, or of a plain agent's.
 
     Args:
-        role: who learns.
+        role: the role that learns.
         reflexes: in force while it acts.
         starts: how calls of the skill start; None: wherever it may.
         limit: the most steps of a call; None: the skill's own limit.

@@ -77,7 +77,7 @@ class LoopState:
         )
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Restore a ``state``.
+        """Restore the counts and metrics of a ``state``.
 
         Raises:
             ValueError: the tensors do not fit.
@@ -186,7 +186,7 @@ class Loop:
         return self.at
 
     def _round(self) -> None:
-        """Collect once, and learn from the result, or start to."""
+        """Collect the rows of one request, and learn from them, or start to."""
         at, learner = self.at, self.learner
         collected = self.collectors.collect(self._requested)
         if self.on_calls is not None and collected.calls is not None:

@@ -73,7 +73,7 @@ class PeriodicEvaluation:
         *,
         also: bool = False,
     ) -> dict[str, float]:
-        """Evaluate if it is time to, and return metrics; else none.
+        """Evaluate the agent if it is time to, and return metrics; else none.
 
         Args:
             since: steps of training at the report before.
@@ -100,7 +100,7 @@ class PeriodicEvaluation:
         return metrics | {"eval_success": float((success == 1.0).mean())}
 
     def spent(self) -> int:
-        """Return the environment steps since the previous call."""
+        """Return the environment steps of evaluations since the previous call."""
         made = 0 if self._engine is None else self._engine.steps_made
         since = made - self._counted
         self._counted = made

@@ -63,7 +63,7 @@ class Declared(ABC):
 
     @abstractmethod
     def check_spaces(self) -> Spaces:
-        """Make the environment once, and return its spaces.
+        """Make the declared environment once, and return its spaces.
 
         Raises:
             DeclarationError: a space, a setting or a policy does not fit.
@@ -108,7 +108,7 @@ class PlainAgent(Declared):
         target_of(self.target_return, self.target_success, AGENT)
 
     def check_spaces(self) -> Spaces:
-        """Make the environment once, and return its spaces.
+        """Make the declared environment once, and return its spaces.
 
         Raises:
             DeclarationError: the algorithm does not fit the spaces.
@@ -121,7 +121,7 @@ class PlainAgent(Declared):
         return spaces
 
     def stages(self) -> list[Stage]:
-        """Return its only stage."""
+        """Return the agent's only stage of training."""
         target = target_of(self.target_return, self.target_success, AGENT)
         spec = self.spec
         return [

@@ -40,7 +40,7 @@ class PlayedCalls:
     where its work is done would succeed each time.
 
     Args:
-        policy: that plays.
+        policy: the policy that plays.
         spaces: of the environments' observations and actions.
         info: keys of ``info`` to record.
         own_rewards, inside, steps, spec: see ``Recorder``.
@@ -139,6 +139,7 @@ class PlayedCalls:
         }
 
     def _recorders(self, num_envs: int) -> dict[str, Recorder]:
+        """Return a recorder for each level, by its path."""
         recorders = {
             path: Recorder(skills, self._spaces, num_envs, path=path, above=above, **self._how)
             for path, (skills, above) in self._levels.items()
@@ -149,7 +150,7 @@ class PlayedCalls:
         return recorders
 
     def _calls(self, path: str, played: PlayedStep) -> Memory:
-        """Return what a level's calls did in a step."""
+        """Return the calls of a level in a step, by columns of a recorder."""
         if self.alone is not None and not path:
             return self._of_alone(self.alone, played)
         if not self.declared:
@@ -170,7 +171,7 @@ class PlayedCalls:
         return calls
 
     def _of_alone(self, skill: Skill, played: PlayedStep) -> Memory:
-        """Return what the calls of a skill that acts alone did in a step."""
+        """Return the calls of a skill that acts alone, by columns of a recorder."""
         rows, step = played.rows, played.step
         tau = self._tau[rows]
         tau[step.elapsed == 1] = WAITS

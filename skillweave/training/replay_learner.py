@@ -193,7 +193,7 @@ class ReplayLearner:
         return self.counts() | tensors
 
     def counts(self) -> dict[str, Tensor]:
-        """Return the counts of transitions and the open episodes' returns."""
+        """Return the replay learner's counts of transitions, and the returns of open episodes."""
         counts = {"transitions": torch.from_numpy(self._transitions.copy())}
         if self._returns is not None:
             counts["returns"] = torch.from_numpy(self._returns.copy())
@@ -281,7 +281,7 @@ def learner_of(
     row_steps: int = 1,
     goes_on_at: int = 0,
 ) -> RolloutLearner | ReplayLearner:
-    """Return the learner of one stack: from rollouts or from replay, by its algorithm.
+    """Return the learner of one stack of members: from rollouts or replay, by its algorithm.
 
     Args:
         quota: see ``RolloutLearner``; None: half of a rollout, where a row is a step.

@@ -35,20 +35,20 @@ class Role:
     """The number of a selector's choices, or of a critic's values; None: it acts in the
     environment."""
     chosen_goals: Mapping[str, gym.Space[Any]] = field(default_factory=dict)
-    """Of a selector, the spaces of the goals that it chooses, by the names of their skills."""
+    """The spaces of the goals that a selector chooses, by the names of their skills."""
     observed_goals: Mapping[str, gym.Space[Any]] = field(default_factory=dict)
-    """Of a critic, the spaces of the goals of calls, which it observes, by the names of skills."""
+    """The spaces of the goals of calls that a critic observes, by the names of skills."""
     own_goals: gym.Space[Any] | None = None
-    """Of a selector and a critic, the space of the goals of their hierarchy, as a skill, which they
-    observe, too; None: it has none."""
+    """The space of the goals of the hierarchy as a skill, which its selector and critic observe;
+    None: it has none."""
     skills: tuple[str, ...] = ()
-    """Of a selector, the names of the skills that it chooses from, in order."""
+    """The names of the skills that a selector chooses from, in order."""
     row_steps: int = 1
     """Approximate environment steps of a row of its experience."""
     greedy: bool = True
     """It acts greedily in evaluations."""
     rest: Any = "zero"
-    """Of a skill's hierarchy: the value of actions where the skill writes nothing."""
+    """The value of actions where the skill writes nothing, of its hierarchy."""
     margin: float | None = None
     """A critic's margin of interruption; None: it interrupts no call."""
     guide_kl: float | None = None

@@ -260,7 +260,7 @@ def levels_of(skills: Mapping[str, SkillReport]) -> dict[str, dict[str, SkillRep
 
 
 def all_steps(skills: Mapping[str, SkillReport]) -> int:
-    """Return the environment steps of all skills, each step counted once."""
+    """Return the environment steps in all skills' reports, each step counted once."""
     top = [name for name in skills if level_of(name) not in skills]
     return sum(skills[name].steps for name in top)
 

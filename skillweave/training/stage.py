@@ -38,7 +38,7 @@ Policies = Mapping[str, Policy]
 def target_of(
     target_return: float | None, target_success: float | None, where: str
 ) -> Target | None:
-    """Return the target of two settings, of which one may be given.
+    """Return the target of a stage, of two settings of which one may be given.
 
     Args:
         where: the stage or skill, for messages.

@@ -85,7 +85,7 @@ class StageLog:
         return any(callback.stopped for callback in self._callbacks)
 
     def stands(self, update: int, steps: int, seconds: float) -> None:
-        """Set the counts of the next checkpoint."""
+        """Set the counts of updates, steps and seconds for the next checkpoint."""
         self.at.update = update
         self.at.steps = steps
         self.at.seconds = seconds
@@ -299,7 +299,7 @@ class StageLog:
 
 
 def resumed(log: StageLog, restore: Callable[[], T]) -> T:
-    """Return the result of ``restore``, which restores environments from a checkpoint.
+    """Restore environments from a checkpoint by ``restore``; errors name the run and the stage.
 
     Raises:
         RunError: the content of the checkpoint is wrong.

@@ -112,7 +112,7 @@ def save_logged(
     """Write the calls of a finished stage into its run.
 
     Args:
-        policies: that the stage has trained, by path.
+        policies: the policies that the stage has trained, by path.
     """
     skills = recorder.skills
     learning = {names_in(path)[0] for path in entry.learns} & {s.name for s in skills.skills}

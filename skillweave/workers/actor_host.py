@@ -28,7 +28,7 @@ def actor_class() -> type:
 
     class CollectorActor:
         def versions(self) -> dict[str, Any]:
-            """Return the versions of what runs here, and the node."""
+            """Return the versions of this node's packages, and the node."""
             found: dict[str, Any] = {"node": ray.util.get_node_ip_address()}
             found |= {"process": os.getpid(), "Python": platform.python_version()}
             for package in (*packages, "skillweave"):
@@ -39,7 +39,7 @@ def actor_class() -> type:
             return found | {"Skillweave": found.pop("skillweave")}
 
         def make(self, code: bytes, each: int, number: int) -> Any:
-            """Make the collector: (error, None)."""
+            """Make the collector in this actor; return (error, None)."""
             try:
                 from skillweave.workers.actor_host import ActorHost
             except ImportError as error:
@@ -48,7 +48,7 @@ def actor_class() -> type:
             return self.stationed.make(code, each, number)
 
         def answer(self, what: str, task: Any) -> Any:
-            """Do something: (error, answer)."""
+            """Do a task in this actor; return (error, answer)."""
             return self.stationed.answer(what, task)
 
         def close(self) -> None:
@@ -60,12 +60,12 @@ def actor_class() -> type:
 
 
 class ActorHost:
-    """A station whose errors are answers."""
+    """The host of a collector in an actor; it returns errors as answers."""
 
     station: WorkerHost | None = None
 
     def make(self, code: bytes, each: int, number: int) -> tuple[SentError | None, None]:
-        """Make the collector."""
+        """Make the collector; return (error, None)."""
         import torch
 
         torch.set_num_threads(1)
@@ -76,7 +76,7 @@ class ActorHost:
         return _tried(made)
 
     def answer(self, what: str, task: Any) -> tuple[SentError | None, Any]:
-        """Return the station's answer."""
+        """Do a task in the collector; return (error, answer)."""
         if isinstance(task, dict):  # a state; arrays of the object store cannot be written to
             task = {k: np.array(v) for k, v in task.items()}
         station: Any = self.station

@@ -43,10 +43,10 @@ FULL = exceptions.ObjectStoreFullError, exceptions.OutOfDiskError
 
 
 class Actors:
-    """The actors of a run, kept from stage to stage; in each stands one collector.
+    """The actors of a run, kept from stage to stage; each holds one collector.
 
     Args:
-        count: how many there may be at once; the cluster keeps room for them.
+        count: the most actors at once; the cluster keeps room for them.
         cpus: of each.
         patience: seconds to wait while the cluster has no room for them.
         tell: called with sentences for people.
@@ -79,21 +79,21 @@ class Actors:
                 ray.kill(self._actors.pop(number))
 
     def let_close(self) -> None:
-        """Let them close their environments; end those that do not."""
+        """Let the actors close their environments; end those that do not."""
         with suppress(Exception):  # perhaps there is no cluster any more
             closed = {actor.close.remote(): number for number, actor in self._actors.items()}
             for late in ray.wait(list(closed), num_returns=len(closed), timeout=PATIENCE)[1]:
                 self.end(closed[late])
 
     def close(self) -> None:
-        """End them all."""
+        """End all actors."""
         for number in list(self._actors):
             self.end(number)
         with suppress(Exception):
             remove_placement_group(self._group)
 
     def tell_versions(self, there: dict[str, Any]) -> None:
-        """Say once for each node what runs there in another version than here."""
+        """Report once for each node which packages differ in version from this machine's."""
         found = differing_versions(there)
         if found and there["node"] not in self._told_versions:
             self._told_versions.add(there["node"])
@@ -103,7 +103,7 @@ class Actors:
             )
 
     def wait_for(self, ref: Any) -> None:
-        """Until an actor has answered.
+        """Wait until an actor has answered.
 
         Raises:
             TrainingError: there was no room for it for too long.
@@ -138,7 +138,7 @@ class ActorWorker(Worker):
 
     Args:
         actors: where.
-        code: what makes the collector, packed, in the object store.
+        code: the packed function that makes the collector, in the object store.
         each: its environments.
         number: of the worker, and of its actor.
         alone: no answers of other workers are joined with its own.
@@ -155,11 +155,11 @@ class ActorWorker(Worker):
         self._due = deque[Any]()
         self._lost = ""
         self.place: dict[str, Any] = {}
-        """Its node and process, and what runs there."""
+        """The actor's node, process and versions."""
         self._versions: Any = None
 
     def begin(self) -> None:
-        """Ask for an actor, which makes the collector."""
+        """Request an actor, which makes the collector."""
         if self._lost:
             self._actors.tell(f"worker {self._number} {self._lost}; it is made again")
         actor = self._actors.get(self._number)
@@ -167,11 +167,11 @@ class ActorWorker(Worker):
         self._due = deque([actor.make.remote(self._code, self._each, self._number)])
 
     def send(self, what: str, task: Any) -> None:
-        """Ask for something."""
+        """Send a task to the actor."""
         self._due.append(self._actors.get(self._number).answer.remote(what, task))
 
     def receive(self) -> Any:
-        """Return the next answer."""
+        """Return the actor's next answer."""
         ref = self._due.popleft()
         try:
             if self._versions is not None:
@@ -215,7 +215,7 @@ def actor_workers(
         make: makes the collector of each.
         each: environments of a worker.
         count: W.
-        name: what messages call the environment.
+        name: the environment's name in messages.
     """
     code = _put(packed(make, f"what collectors of {name} are made of"))
     return [ActorWorker(actors, code, each, i, count == 1) for i in range(count)]
@@ -229,6 +229,7 @@ def _put(thing: Any) -> Any:
 
 
 def _full(error: Exception) -> TrainingError:
+    """Return the error of a full object store of a Ray cluster."""
     return TrainingError(
         f"the object store of the Ray cluster is full ({error_text(error)}). Batches "
         "go through it: give it more memory (ray start --object-store-memory=BYTES), or ask for "
@@ -268,7 +269,7 @@ def differing_versions(there: dict[str, Any]) -> str:
 
 
 def _how(lost: Exception) -> str:
-    """Describe what became of an actor."""
+    """Return words on the end of a Ray actor."""
     if isinstance(lost, exceptions.OutOfMemoryError):
         return "was ended by Ray, as its node was short of memory"
     if isinstance(lost, exceptions.ActorUnavailableError):

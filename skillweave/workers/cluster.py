@@ -40,14 +40,14 @@ class Ray:
     """
 
     collectors: AtLeastOne | None = None
-    """How many; the environments of a stage are shared out equally, or the members of a population.
+    """Number of collectors; they share a stage's environments equally, or a population's members.
     None: as many as there would be processes without Ray. A run keeps the number, as results depend
     on it."""
     address: Annotated[str, Check("a text such as '10.0.0.1:6379'")] | None = None
     """``host:port`` of a cluster's head, ``ray://host:port``, or ``auto``: the one that runs on
     this machine. None: what RAY_ADDRESS says, or else a new one of this machine alone."""
     cpus: Positive = 1.0
-    """Of the cluster's CPUs, what each collector takes."""
+    """CPUs of the cluster that each collector takes."""
     patience: NonNegative = 300.0
     """Seconds to wait while the cluster has no room for all collectors, or lost some of it."""
 
@@ -68,10 +68,10 @@ class Ray:
 
     @contextmanager
     def joined(self, most: int) -> Iterator[Any]:
-        """Be connected to the cluster; the module ``ray``.
+        """Connect this process to the cluster for a block; yield the module ``ray``.
 
         Args:
-            most: what will run at once.
+            most: the number of workers that will run at once.
 
         Raises:
             MissingExtra: the extra 'ray' is not installed.
@@ -93,7 +93,7 @@ class Ray:
 
     @contextmanager
     def connected(self, most: int, tell: Callable[[str], None]) -> Iterator[Placement]:
-        """Be connected to the cluster; what makes collectors and other workers on it.
+        """Connect to the cluster for a block; yield the placement of workers on it.
 
         Args:
             most: workers that will run at once.
@@ -110,6 +110,7 @@ class Ray:
             def make_collectors(
                 make: MakeCollector, num_envs: int, workers: int, members: int, name: str
             ) -> Collectors:
+                """Return collectors in actors, which share the environments."""
                 each = share_of(num_envs, workers, members, name)
                 elsewhere = actor_workers(actors, make, each, workers, name)
                 return WorkerCollectors(elsewhere, each, members, name)
@@ -123,6 +124,7 @@ class Ray:
                 actors.close()
 
     def _connect(self, ray: Any, most: int) -> None:
+        """Connect this process to the cluster by ``ray.init``."""
         address = self._where
         how: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
         if address == "local":  # as many as were asked for, be there cores or not
@@ -149,7 +151,7 @@ class Ray:
 
 
 def imported() -> Any:
-    """Ray, with its own output off.
+    """Import Ray with its own output off, and return it.
 
     Raises:
         MissingExtra: it is not installed.
@@ -178,7 +180,7 @@ def _must_be_joined(ray: Any, address: str) -> None:
 
 
 def _is_outside(host: str) -> bool:
-    """Return whether a host is a number that is not this machine's own."""
+    """Return whether a host's number is not one of this machine."""
     try:
         return not ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:

@@ -1,4 +1,4 @@
-"""Collectors that run elsewhere: what they are asked for, and how lost ones are made again.
+"""Collectors that run elsewhere: their tasks, and the recreation of lost ones.
 
 A collector is a function of its state and of what it is asked for. So a lost worker, a
 process or a machine, is recreated from its last state and repeats the requests since then; the
@@ -44,23 +44,23 @@ def error_to_send(error: BaseException) -> SentError:
 
 
 class WorkerLost(Exception):
-    """A worker's process or machine is no more; the message says what became of it."""
+    """The error of a worker whose process or machine has ended; the message says why."""
 
 
 class Worker:
-    """Somebody elsewhere who has a collector: it does one task after another."""
+    """A worker elsewhere, which has a collector: it does one task after another."""
 
     tries = 1
-    """How often a lost one is made again before a request fails."""
+    """Number of times that a lost worker is made again before a request fails."""
     who = ""
     """Its name in messages; ``Workers`` gives it."""
 
     def begin(self) -> None:
-        """Have the collector made; ``receive`` then gives None."""
+        """Start the worker, which makes its collector; ``receive`` then returns None."""
         raise NotImplementedError
 
     def send(self, what: str, task: Any) -> None:
-        """Ask for something; see ``WorkerHost.answer``.
+        """Send a task to the worker; see ``WorkerHost.answer``.
 
         Raises:
             WorkerLost: it has ended.
@@ -77,11 +77,11 @@ class Worker:
         raise NotImplementedError
 
     def release(self) -> None:
-        """End it, if it has not ended."""
+        """End the worker, if it has not ended."""
         raise NotImplementedError
 
     def release_all(self, workers: Sequence[Any]) -> None:
-        """End workers of its kind, itself among them."""
+        """End workers of this kind, this one among them."""
         for worker in workers:
             worker.release()
 
@@ -103,7 +103,7 @@ class WorkerHost:
         self.collector = make(each, number * each)
 
     def answer(self, what: str, task: Any) -> Any:
-        """Do what a method of the collector does; a request is for all workers."""
+        """Do a task by the collector's method of this name; a request is for all workers."""
         if what == "state":
             return self.collector.state()
         if what != "collect":
@@ -116,7 +116,7 @@ class WorkerHost:
 
 
 class LocalWorker(Worker):
-    """A worker in this thread: it does a task when it is asked for the answer.
+    """A worker in this thread: it does a task when its answer is requested.
 
     Args:
         each: its environments, if it has a collector.
@@ -131,11 +131,11 @@ class LocalWorker(Worker):
         self._due = deque[tuple[str, Any]]()
 
     def begin(self) -> None:
-        """Have the collector made; ``receive`` then gives None."""
+        """Queue the making of the collector; ``receive`` then returns None."""
         self._due.append(("", None))
 
     def send(self, what: str, task: Any) -> None:
-        """Ask for something."""
+        """Queue a task for the collector."""
         self._due.append((what, task))
 
     def receive(self) -> Any:
@@ -147,7 +147,7 @@ class LocalWorker(Worker):
         return self._station.answer(what, task)
 
     def release(self) -> None:
-        """Close what stands here."""
+        """Close the collector in this thread."""
         station = self._station
         self._station = None
         if station is not None:
@@ -155,11 +155,11 @@ class LocalWorker(Worker):
 
 
 class Workers:
-    """Workers that are asked side by side; those that are lost are made again.
+    """Workers that do tasks at the same time; lost ones are made again.
 
     Args:
         workers: W of them, of one kind.
-        name: what messages call the environment.
+        name: the environment's name in messages.
 
     Raises:
         SkillweaveError: a task failed; the kind is the kind of its error.
@@ -171,7 +171,7 @@ class Workers:
         for number, worker in enumerate(workers):
             worker.who = f"{name}: worker {number}{self._whose(number)}"
         self._past: list[tuple[str, Sequence[Any]]] = []
-        """What brings workers to where they stand: a start or states, then tasks."""
+        """Tasks that bring a new worker to the present state: a start or states, then requests."""
         try:
             for worker in self._workers:
                 worker.begin()
@@ -192,7 +192,7 @@ class Workers:
         return self._completed(self._asked(range(len(self._workers)), what, tasks), path)
 
     def states(self) -> list[dict[str, Array]]:
-        """Return the states of the workers; lost ones go back no further from now on."""
+        """Return the workers' states, from which lost ones are made again from now on."""
         states: list[dict[str, Array]] = self.ask("state", [None] * len(self._workers), kept=False)
         self._past = [("restore", states)]
         return states
@@ -219,7 +219,7 @@ class Workers:
     def _again(
         self, numbers: list[int], path: Sequence[tuple[str, Sequence[Any]]], must: bool
     ) -> dict[int, Any]:
-        """Make workers again, and let them do all that others did."""
+        """Make lost workers again, and let them repeat the tasks that the others have done."""
         for i in numbers:
             self._workers[i].release()
         for i in numbers:
@@ -259,18 +259,18 @@ class Workers:
         return found
 
     def _whose(self, number: int) -> str:
-        """Describe a worker's environments for messages."""
+        """Return words on a worker's environments, for messages."""
         return ""
 
 
 class WorkerCollectors(Workers, Collectors):
-    """Collectors elsewhere, each with as many environments.
+    """Collectors in workers elsewhere, each with as many environments.
 
     Args:
         workers: W of them.
         each: environments of a worker.
         members: P.
-        name: what messages call the environment.
+        name: the environment's name in messages.
     """
 
     def __init__(self, workers: Sequence[Worker], each: int, members: int, name: str) -> None:
@@ -290,7 +290,7 @@ class WorkerCollectors(Workers, Collectors):
             self.ask("start", [seeds / number for number in range(len(self._workers))])
 
     def collect(self, request: Request) -> Collected:
-        """``request.rows`` steps of each environment."""
+        """Step each environment ``request.rows`` times, and return the joined rows."""
         task = self._workers[0].shared(request)
         answers: list[Collected] = self.ask("collect", [task] * len(self._workers))
         self._stands = [answer.stands for answer in answers]  # type: ignore[misc]
@@ -300,7 +300,7 @@ class WorkerCollectors(Workers, Collectors):
         return found
 
     def state(self) -> dict[str, Array]:
-        """Return what ``restore`` needs. Only a worker that is lost meanwhile can change."""
+        """Return the states of all workers' collectors, joined, for ``restore``."""
         return joined_states(self.states())
 
     def restore(self, state: dict[str, Array]) -> Array:
@@ -308,13 +308,14 @@ class WorkerCollectors(Workers, Collectors):
         return self._columns(self.stand(split_states(state, len(self._workers))))
 
     def finish(self) -> None:
-        """Check at the end of training what it has left in the environments.
+        """Check at the end of training that it has left nothing in the environments.
 
         A worker that is lost in it is not made again: the training result is there.
         """
         self._asked(range(len(self._workers)), "finish", [None] * len(self._workers))
 
     def _did_again(self, what: str, found: dict[int, Any]) -> None:
+        """Note the environments that a recreated worker could not restore or repeat."""
         for i, answer in found.items():
             if what == "restore":
                 self._differ[i] = answer
@@ -322,7 +323,7 @@ class WorkerCollectors(Workers, Collectors):
                 self._differ[i] = np.flatnonzero(answer.stands != self._stands[i])
 
     def differing(self) -> Array:
-        """(k,) environments that are not where they were, since they were lost with a worker."""
+        """Return the environments (k,) that are in another state since a worker was lost."""
         found = self._columns(self._differ)
         none = np.empty(0, np.int64)
         self._differ = [none] * len(self._differ)

@@ -105,7 +105,7 @@ class ProcessWorker(Worker):
             theirs.close()
 
     def send(self, what: str, task: Any) -> None:
-        """Send a request.
+        """Send a task to the process.
 
         Raises:
             WorkerLost: the process has ended.
@@ -123,7 +123,7 @@ class ProcessWorker(Worker):
             ) from error
 
     def receive(self) -> Any:
-        """Return the next answer; arrays of an experience are valid until the next task.
+        """Return the process's next answer; arrays of rows are valid until the next task.
 
         Raises:
             WorkerLost: the process has ended.
@@ -199,7 +199,7 @@ class ProcessWorker(Worker):
         self._told = True
 
     def _end(self) -> str:
-        """Return words for how its process ended."""
+        """Return words on the end of its process."""
         self.process.join(DYING)
         code = self.process.exitcode
         if code is not None:
@@ -230,7 +230,7 @@ def _by_signal(number: int) -> str:
 
 
 def _described(what: str, task: Any) -> str:
-    """Return words for what a worker does for a task, to follow "it is"."""
+    """Return words on a worker's task, to follow "it is"."""
     if what == "collect":
         return f"making {task.rows:,} steps in each of its environments"
     return {

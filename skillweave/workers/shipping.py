@@ -38,12 +38,12 @@ def add_folder(folder: Path) -> None:
 
 
 def packed(thing: Any, who: str) -> bytes:
-    """Anything with the code that it needs: recipes, scripts, and what they registered.
+    """Pickle a thing with the user's code that it needs: recipes, scripts, and registrations.
 
     What is installed is only named, so it must be installed where this is unpacked.
 
     Args:
-        who: what messages call it.
+        who: its name in messages.
 
     Raises:
         DeclarationError: something in it belongs to this process, such as an open file.
@@ -74,7 +74,7 @@ def unpacked(data: bytes) -> Any:
 
 @contextmanager
 def _own_code() -> Iterator[None]:
-    """Pickle modules by their content where they are not installed."""
+    """Pickle modules by their content where they are not installed, for a block."""
     known = cloudpickle.list_registry_pickle_by_value()
     # Each once: where a process was spawned, the user's script stands there by two names.
     modules = {id(m): m for m in list(sys.modules.values())}.values()  # not all have a hash

@@ -40,13 +40,13 @@ class TorchModes:
 
     @classmethod
     def here(cls) -> TorchModes:
-        """Return those of this thread."""
+        """Return PyTorch's modes in this thread."""
         import torch
 
         return cls(torch.is_grad_enabled(), torch.get_default_dtype())
 
     def set(self) -> None:
-        """Set them in this thread."""
+        """Set these modes in this thread."""
         import torch
 
         torch.set_grad_enabled(self.gradients)
@@ -144,6 +144,7 @@ def _end_with(parent: int | None) -> None:
     first = parent or os.getppid()
 
     def watch() -> None:
+        """Wait until the parent has ended, then end this process and its group."""
         # is_alive() is late where workers forked later hold copies of its pipe.
         while started_by.is_alive() and os.getppid() == first:
             sleep(LOOK)

@@ -12,7 +12,7 @@ from skillweave._internal.terminal import say
 from skillweave.runs.trackers import wandb_mode
 
 _messages: list[str] = []
-"""What has not been printed yet."""
+"""Messages that have not been printed yet."""
 
 
 def stay_offline() -> None:

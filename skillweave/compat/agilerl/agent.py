@@ -148,7 +148,7 @@ class AgilerlAgent:
         """Return actions (B, ...) in the environment's units.
 
         Args:
-            explore: whether the algorithm adds its own exploration.
+            explore: the algorithm adds its own exploration.
             epsilon: probability that all actions are drawn uniformly instead.
             mask: (A,) or (B, A), allowed actions.
         """

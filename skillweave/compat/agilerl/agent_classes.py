@@ -88,7 +88,7 @@ class PPO(AgilerlAgent):
         return float(losses["policy_loss"] + value_part)
 
     def rollout(self, experiences: Any) -> Rollout:
-        """Return what ``learn`` takes, of N environments, as a rollout.
+        """Return the experiences of N environments that ``learn`` takes as a rollout.
 
         The successor of a step is the next entry of the states. Actions are in policy units, and
         count as drawn with the log-probabilities given.

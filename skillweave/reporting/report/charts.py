@@ -67,7 +67,7 @@ def layer(mark: Spec, rows: Sequence[Mapping[str, Any]] | None = None, **encodin
 
 
 def tips(*fields: Sequence[str], **rest: Any) -> list[dict[str, Any]]:
-    """Return what is shown under the pointer: of each field its name, its title, its format."""
+    """Return the fields of a chart's tooltip: of each its name, its title and its format."""
     return [dict(zip(("field", "title", "format"), f, strict=False)) | rest for f in fields]
 
 

@@ -233,7 +233,7 @@ WHY = {
 }
 """Ends of calls in the page's words."""
 WORDS: Words = (percent, number, "in the last step")
-"""How the page writes the rows of skills."""
+"""Formats and words of the page's table of skills."""
 
 
 def about(skill: Skill) -> str:

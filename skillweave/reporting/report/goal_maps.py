@@ -31,7 +31,7 @@ def goal_pictures(
     Args:
         logs: of the levels, by path.
         skills: by path.
-        of: where the calls are from, in words.
+        of: the origin of the calls, in words.
 
     Returns:
         Of each: ``name``, ``words``, and ``spec``, its chart.

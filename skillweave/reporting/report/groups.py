@@ -107,7 +107,7 @@ class OverSeeds:
     seeds: int
     mean: Array
     low: Array
-    """Of one seed it is the mean, as is ``high``."""
+    """The lower bound; of one seed it is the mean, as is ``high``."""
     high: Array
 
     @property

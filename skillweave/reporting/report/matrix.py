@@ -106,7 +106,7 @@ def _words(
     shown: Mapping[tuple[int, int], Mapping[str, Any]],
     named: ObsNames | None,
 ) -> dict[str, Any]:
-    """Return what the section's words are made of; ``shown``: of each cell."""
+    """Return the values for the template of the section; ``shown``: those of each cell."""
     rows = [
         {
             "name": name if i else "start of an episode",

@@ -24,10 +24,10 @@ class Page:
     """A page that is being made; each section puts its parts into it."""
 
     context: dict[str, Any] = field(default_factory=dict)
-    """What its words are made of; ``film``: of episodes, and ``hand_film``: of calls of one skill
-    after another, if there are any."""
+    """Values for the page's template; ``film``: of episodes, and ``hand_film``: of calls of one
+    skill after another, if there are any."""
     data: dict[str, Any] = field(default_factory=dict)
-    """What its charts and films need, as plain JSON without NaN."""
+    """Data of the page's charts and films, as plain JSON without NaN."""
     missing: list[str] = field(default_factory=list)
     """Sentences on what is not in it."""
     began: float = field(default_factory=time.perf_counter)

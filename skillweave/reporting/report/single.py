@@ -71,7 +71,7 @@ class Played:
     score: Evaluation
     log: PlayedEpisodes
     colors: dict[str, RGB]
-    """Of each of the log's labels."""
+    """The color of each of the log's labels."""
     with_goals: dict[str, Skill]
     """The skills with goals, by path."""
 
@@ -92,7 +92,7 @@ def write_report(
     """Write a run's report: one HTML file.
 
     Args:
-        policy, spec: what was trained, and on what; None: no episodes are played.
+        policy, spec: the trained policy and its environment; None: no episodes are played.
         why_not: the reason why there is no policy, where the run itself is finished.
         episodes: to play, with seeds that training never used.
         filmed: number of these in the film, from the worst to the best.
