@@ -5,6 +5,7 @@ A mistake ends in an error of a kind, which names the thing, or in a warning; wh
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import warnings
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from toys import World
 
 import skillweave as sw
 from skillweave import recipes
+from skillweave._internal.messages import ELSEWHERE, RECORDINGS, STARTS
 from skillweave.errors import KINDS, SkillError, SkillweaveError
 from skillweave.skills.selector import FunctionSelector
 
@@ -341,6 +343,15 @@ MISTAKES: dict[str, dict[str, tuple[Callable[[], Any], str]]] = {
             lambda: declare().train("runs/de", demonstrations="demos.npz"),
             "recorded data",
         ),
+        "other starts": (
+            lambda: sw.EnvSpec("CartPole-v1", initial_state=(0, 0, 0, 0)),
+            "EnvSpec has no setting 'initial_state': episodes start where",
+        ),
+        "other starts in train_agent": (
+            lambda: sw.train_agent("CartPole-v1", SMALL, 16, reset_options={"low": -0.1}),
+            "'reset_options': episodes start where",
+        ),
+        "options of the literature": (lambda: declare(options=[Good()]), "is 'skills' meant?"),
         "wrong key in sees": (lambda: in_room(sees=("hold",)), "is 'held' meant?"),
         "seed as text": (lambda: declare().train("runs/sd", seed="1"), "it must be a whole number"),
     },
@@ -508,6 +519,8 @@ WARNED = {
     "done": ({"done": lambda _, step: step.next_obs[:, 0] > 1}, "termination"),
     "max_step": ({"max_step": 5}, "max_steps"),
     "time_limit": ({"time_limit": 5}, "max_steps"),
+    "predict": ({"predict": lambda _, obs: zeros(_, obs)}, "policy"),
+    "rest": ({"rest": 0.0}, "Hierarchy.rest"),
 }
 
 
@@ -516,6 +529,16 @@ def test_a_misspelt_attribute_of_a_skill_is_a_warning(name):
     members, meant = WARNED[name]
     with pytest.warns(UserWarning, match=f"has '{name}', .* is '{meant}' meant"):
         declare(skills=[skill(**members)])
+
+
+def test_names_of_other_libraries_mean_names_that_exist():
+    settings = (sw.Hierarchy, sw.EnvSpec, sw.PPO, sw.DQN, sw.Network, sw.TrainDefaults)
+    known = {field.name for kind in settings for field in dataclasses.fields(kind)}
+    known |= set(inspect.signature(sw.Run.evaluate).parameters) | set(vars(sw.Skill))
+    known |= {f"Hierarchy.{field.name}" for field in dataclasses.fields(sw.Hierarchy)}
+    assert len(ELSEWHERE) <= 30
+    assert ELSEWHERE.keys() & known == {"rest"}  # which is a setting, and not of a skill
+    assert set(ELSEWHERE.values()) <= known | {STARTS, RECORDINGS}
 
 
 def test_a_misspelt_attribute_of_a_skills_instance_is_a_warning():

@@ -255,19 +255,6 @@ def test_one_environment_of_a_simulator_trains(tmp_path):
 # Starts
 
 
-@pytest.mark.parametrize("name", ["options", "reset_options", "initial_state", "start_states"])
-def test_other_starts_are_a_wrapper(name):
-    for ask in (
-        lambda **more: sw.EnvSpec("CartPole-v1", **more),
-        lambda **more: sw.train_agent("CartPole-v1", SMALL, 16, **more),
-        lambda **more: sw.evaluate(None, "CartPole-v1", **more),
-    ):
-        with pytest.raises(sw.SkillweaveError, match=f"no .* {name!r}: episodes start where"):
-            ask(**{name: {"low": -0.1}})
-    with pytest.raises(sw.SkillweaveError, match="'options': is 'skills' meant"):
-        sw.Hierarchy("CartPole-v1", options=[])
-
-
 class Wide(gym.Wrapper):
     def reset(self, *, seed=None, options=None):
         return self.env.reset(seed=seed, options={"low": 0.03, "high": 0.04})

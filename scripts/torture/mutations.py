@@ -345,14 +345,14 @@ def _raw_header(rng: random.Random, path: Path, folder: Path) -> tuple[str, str,
 
 
 def _header(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool]:
-    """Change Skillweave's own header, and correct its checksum where JSON can hold it."""
+    """Change Skillweave's own header, and correct its checksum where people share the file."""
     tensors, header = _parts(path)
     where, how = mutate_tree(rng, header)
     return where, how, _seal(rng, path, folder, tensors, header)
 
 
 def _tensors(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool]:
-    """Other tensors under a checksum made right again."""
+    """Change tensors, and correct the checksum where people share the file."""
     tensors, header = _parts(path)
     if not tensors:
         return "nothing", "", False
@@ -400,15 +400,19 @@ def _parts(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
 def _seal(rng: random.Random, path: Path, folder: Path, tensors: Any, header: Any) -> bool:
     """Write the parts with a right checksum, in half of the cases also where run.json says it.
 
-    Returns whether the file may act otherwise now: nothing vouches for what it was before.
+    A file that only its own run reads keeps the checksum of what it held: with a right one it is
+    trusted. Returns whether the file may act otherwise now: nothing vouches for what it was before.
     """
-    old = header.pop("sha256", None) if isinstance(header, dict) else None
     text = json.dumps(header)
     marks = (DEEP, DIGITS, EXPONENT, "NaN", "Infinity", "\\ud800")
     if not isinstance(header, dict) or any(m in text for m in marks):
         size = dump(rng, {"__metadata__": {"skillweave": dump(rng, header)}}).encode()
         path.write_bytes(len(size).to_bytes(8, "little") + size)
         return False
+    if "checkpoint" in path.name or path.parent.name in ("states", "final"):
+        path.write_bytes(safetensors.torch.save(tensors, {"skillweave": text}))
+        return False
+    old = header.pop("sha256", None)
     write_tensors(path, tensors, header)
     manifest = path.parent.parent / "run.json"
     if rng.random() < 0.5 and isinstance(old, str) and manifest.exists():
@@ -416,7 +420,7 @@ def _seal(rng: random.Random, path: Path, folder: Path, tensors: Any, header: An
         manifest.write_text(said.replace(old, _parts(path)[1]["sha256"]))
         if old in said:
             return True
-    return path.parent == folder or "checkpoint" in path.name
+    return path.parent == folder
 
 
 WAYS: dict[str, list[Callable[[random.Random, Path, Path], tuple[str, bool]]]] = {

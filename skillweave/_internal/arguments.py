@@ -16,47 +16,11 @@ from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, TypeVar
 
-from skillweave._internal.messages import ELSEWHERE, short, suggest
+from skillweave._internal.messages import ELSEWHERE, RECORDINGS, STARTS, short, suggest
 from skillweave.errors import DeclarationError
 from skillweave.policies.floats import usual_floats
 
 T = TypeVar("T", bound=Callable[..., Any])
-
-STARTS = (
-    "options",
-    "reset_options",
-    "reset_kwargs",
-    "start_state",
-    "start_states",
-    "initial_state",
-    "initial_states",
-    "init_state",
-    "start_distribution",
-)
-"""Names under which users look for other starts of episodes."""
-STARTS_BY = (
-    "episodes start where the environment's reset() puts them; to start elsewhere, give a wrapper "
-    "whose reset() passes on options or sets the state, EnvSpec(env, wrappers=(Elsewhere,)): the "
-    "documentation has its lines, under 'A curriculum', 'Start episodes elsewhere'"
-)
-
-RECORDINGS = (
-    "demonstrations",
-    "demos",
-    "dataset",
-    "expert",
-    "expert_data",
-    "trajectories",
-    "transitions",
-)
-"""Names under which users look for learning from recorded data."""
-RECORDINGS_BY = (
-    "Skillweave does not learn from demonstrations or other recorded data; learn a policy from "
-    "them with another library, and start from it: train(start_from=from_torch(policy, "
-    "learn=True)), or from_sb3"
-)
-ABSENT = dict.fromkeys(STARTS, STARTS_BY) | dict.fromkeys(RECORDINGS, RECORDINGS_BY)
-"""By a name that users look for, a sentence on what to do instead."""
 
 
 def checked_names(target: T) -> T:
@@ -122,8 +86,8 @@ def _wrong_arguments(
     if not takes_all and (unknown := [k for k in named if k not in by_name]):
         first = unknown[0]
         end = suggest(first, by_name, {} if owner is None else _other_places(owner, makes))
-        if first in ABSENT and not (first in ELSEWHERE and "skills" in by_name):
-            end = f": {ABSENT[first]}"
+        if (way := ELSEWHERE.get(first)) in (STARTS, RECORDINGS):
+            end = f": {way}"
         return f"{who} has no {what} {first!r}{end}"
     ordered = [p for p in parameters if p.kind is not p.KEYWORD_ONLY]
     if len(args) > len(ordered):

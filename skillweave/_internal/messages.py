@@ -12,21 +12,30 @@ from types import MappingProxyType
 from skillweave._internal.tracebacks import place
 from skillweave.errors import DeclarationError, RunError
 
+STARTS = (
+    "episodes start where the environment's reset() puts them; to start elsewhere, give a wrapper "
+    "whose reset() passes on options or sets the state, EnvSpec(env, wrappers=(Elsewhere,)): the "
+    "documentation has its lines, under 'A curriculum', 'Start episodes elsewhere'"
+)
+RECORDINGS = (
+    "Skillweave does not learn from demonstrations or other recorded data; learn a policy from "
+    "them with another library, and start from it: train(start_from=from_torch(policy, "
+    "learn=True)), or from_sb3"
+)
 ELSEWHERE = {
-    "clip_epsilon": "clip_coef",
+    "can_start": "initiation",
+    "clip_param": "clip_coef",
     "clip_range": "clip_coef",
+    "compute_reward": "reward",
+    "demonstrations": RECORDINGS,
     "discount": "gamma",
-    "discount_factor": "gamma",
-    "entropy_coef": "ent_coef",
+    "done": "termination",
     "env_id": "env",
     "env_kwargs": "kwargs",
-    "epochs": "update_epochs",
     "eval_freq": "eval_every",
-    "hidden_layers": "hidden",
     "hidden_sizes": "hidden",
-    "horizon": "n_steps",
-    "lam": "gae_lambda",
-    "log_dir": "run_dir",
+    "initial_state": STARTS,
+    "is_success": "success",
     "lr": "learning_rate",
     "max_episode_steps": "max_steps",
     "minibatch_size": "batch_size",
@@ -37,12 +46,16 @@ ELSEWHERE = {
     "num_epochs": "update_epochs",
     "num_steps": "n_steps",
     "options": "skills",
-    "polyak": "tau",
-    "total_steps": "steps",
+    "predict": "policy",
+    "reset_options": STARTS,
+    "rest": "Hierarchy.rest",
+    "reward_fn": "reward",
+    "terminated": "termination",
+    "time_limit": "max_steps",
     "total_timesteps": "steps",
-    "value_coef": "vf_coef",
 }
-"""Names that other libraries give to settings, with the names that they have here."""
+"""Names that users of other libraries type, of settings and of a skill's attributes, with the names
+here, or with a sentence on what to do instead. At most 30: similar names are found without it."""
 
 
 def short(value: object, longest: int = 100) -> str:

@@ -134,12 +134,7 @@ class AgentPolicy(Memoryless):
             name: checked_tensor(tensors, name, shape, torch.float32, where)
             for name, shape in algorithm.weight_shapes().items()
         }
-        for name, value in weights.items():
-            if not value.isfinite().all():
-                raise RunError(
-                    f"{where}: tensor {name} holds NaN or infinity: the training had diverged, "
-                    "or the file was altered"
-                )
+        check_finite(weights, where)
         policy = cls(algorithm, weights)
         policy.name_outliers(where)
         return policy
@@ -183,22 +178,29 @@ def checked_tensor(
     return tensor
 
 
+def check_finite(tensors: Mapping[str, Tensor], where: str) -> None:
+    """Raise a RunError where a tensor of a file that people share holds NaN or infinity."""
+    for name, value in tensors.items():
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            raise RunError(
+                f"{where}: tensor {name} holds NaN or infinity: the training had diverged, or the "
+                "file was altered"
+            )
+
+
 def state_from(
     tensors: Mapping[str, Tensor],
     like: S,
     where: str,
     groups: Sequence[ParameterGroup] = (),
-    *,
-    may_diverge: bool = False,
 ) -> S:
     """Read a state from ``tensors`` by field, with the shapes and types of ``like``.
 
     Args:
         groups: of the algorithm, if networks may have grown.
-        may_diverge: allow numbers that are not finite, as in a member that trains no more.
 
     Raises:
-        RunError: a tensor has another shape or type, or a number that is not finite; it is named.
+        RunError: a tensor has another shape or type; it is named.
     """
     shapes = {name: tuple(value.shape) for name, value in vars(like).items()}
     for family in groups:  # after growth each parameter has an age of its own
@@ -208,15 +210,13 @@ def state_from(
         name: checked_tensor(tensors, name, shapes[name], value.dtype, where)
         for name, value in vars(like).items()
     }
-    for name, value in values.items():
-        if not may_diverge and value.is_floating_point() and not bool(value.isfinite().all()):
-            raise RunError(f"{where}: tensor {name} holds NaN or infinity: the file was altered")
     return type(like)(**values)
 
 
 __all__ = [
     "AgentHeader",
     "AgentPolicy",
+    "check_finite",
     "checked_tensor",
     "make_algorithm",
     "state_from",

@@ -97,18 +97,7 @@ class ActingParams:
 
         Weights are copied in place: the last bit of a product of matrices can depend on where they
         lie in memory.
-
-        Raises:
-            ValueError: the state does not fit.
         """
-        current = self.state()
-        if current.keys() != state.keys():
-            different = ", ".join(sorted(current.keys() ^ state.keys()))
-            raise ValueError(f"the parameters of the next rows do not fit: {different}")
-        for name, x in current.items():
-            saved = state[name]
-            if saved.shape != x.shape or saved.dtype != x.dtype or not bool(saved.isfinite().all()):
-                raise ValueError(f"{name} of the parameters of the next rows does not fit")
         for name, view in self.views.items():
             view.copy_(state[f"views.{name}"])
         self.shift, self.scale = (
@@ -308,9 +297,6 @@ class Algorithm:
         if not self.normalize_obs:
             return None, None
         return _scaling(state.obs_mean, state.obs_var)
-
-    def check_state(self, state: Any) -> None:
-        """Raise a RunError where a finite number of a ``state`` is out of its range."""
 
     def layouts(self) -> dict[str, Layout]:
         """Return the layout of each state field that holds parameters or their moments."""

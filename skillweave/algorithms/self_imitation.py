@@ -20,7 +20,6 @@ from skillweave.algorithms.batches import Report, Rollout
 from skillweave.algorithms.config import SelfImitationPPO
 from skillweave.algorithms.ppo import PPOAlgorithm, State as PPOState, Terms
 from skillweave.algorithms.rollouts import Cells, first_true
-from skillweave.errors import RunError
 from skillweave.networks.stacked import Views, take_rows
 from skillweave.ops.device import BOOL, FLOAT, all_false
 from skillweave.ops.returns import gae
@@ -72,17 +71,6 @@ class SelfImitationAlgorithm(PPOAlgorithm):
     def _mask_size(self) -> int:
         """The numbers of a mask; one where actions have no choices."""
         return sum(self.codec.counts) or 1
-
-    def check_state(self, state: Any) -> None:
-        """Raise a RunError where a kept row is not of these spaces."""
-        try:
-            self.obs.check(state.kept_obs)
-            self.codec.check(state.kept_action)
-        except ValueError as error:
-            raise RunError(
-                f"the rows that SelfImitationPPO has kept are damaged: {error}. The file that they "
-                "were read from was altered"
-            ) from error
 
     def update(
         self, state: Any, batch: Rollout, rng: Sequence[torch.Generator]

@@ -128,19 +128,6 @@ class Priorities:
         """Set all priorities to 0."""
         self._trees.leaves[:] = 0.0
 
-    def rebuild(self, member: Array, slot: Array) -> None:
-        """Recompute all sums after the views of ``written`` were changed.
-
-        Args:
-            member, slot: (K,), the slots that hold a transition, so they must have a priority.
-
-        Raises:
-            ValueError: the numbers are no priorities.
-        """
-        leaves = self._trees.leaves
-        for values in leaves, self._highest:
-            if not np.isfinite(values).all() or (values < 0).any():
-                raise ValueError("a priority of its replay buffer is negative or not finite")
-        if not leaves[member, slot].all() or np.count_nonzero(leaves) != len(member):
-            raise ValueError("the priorities of its replay buffer do not belong to its transitions")
+    def rebuild(self) -> None:
+        """Recompute all sums after the views of ``written`` were changed."""
         self._trees.rebuild()

@@ -189,13 +189,12 @@ class ReplayStore:
 
         Raises:
             RunError: the state belongs to other settings.
-            ValueError: a number is out of range.
         """
         self._columns.load(state)
         if self._priorities is not None:
             self._priorities.forget()
             copy_into(self._written_priorities(), state)
-            self._priorities.rebuild(*self._places(self._columns.data["kind"].nonzero()[0]))
+            self._priorities.rebuild()
 
     def _written_priorities(self) -> dict[str, Array]:
         if self._priorities is None:

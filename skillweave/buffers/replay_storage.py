@@ -11,7 +11,6 @@ import numpy as np
 from torch import Tensor
 
 from skillweave.algorithms.batches import Batch
-from skillweave.buffers.held import check_columns
 from skillweave.buffers.ram import check_memory
 from skillweave.errors import DeclarationError, RunError
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
@@ -84,7 +83,6 @@ class Columns:
         """(N,) the newest slot of each column, counted from the first in the run."""
         self._column = np.arange(num_envs)
         self._open = np.zeros(num_envs, bool)  # True where the trajectory goes on
-        self._space = observation_space
         self._choices = choices
         self._keeps_rewards = keep_rewards
         self.raw = tuple(raw)
@@ -162,7 +160,6 @@ class Columns:
 
         Raises:
             RunError: the arrays belong to other settings.
-            ValueError: a number is out of range.
         """
         self.data["kind"][:] = NOTHING
         for name in OPTIONAL:
@@ -177,7 +174,6 @@ class Columns:
         self._rewards = np.zeros(max(self._rewards_used, len(self._rewards)), np.float32)
         copy_into({"newest": self.newest}, state)
         copy_into(self.written(), state)
-        check_columns(self.written(), self._space, self._choices)
 
     def written(self) -> dict[str, Array]:
         """Return views of all that was written, by name."""

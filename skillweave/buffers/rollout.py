@@ -11,9 +11,12 @@ from torch import Tensor
 
 from skillweave._internal.prefixes import unprefixed
 from skillweave.algorithms.batches import SCHEMA, Batch, Reference, Rollout, column
-from skillweave.buffers.held import ONE_ROW, check_held
-from skillweave.spaces import ActionCodec, to_tensor
+from skillweave.errors import RunError
+from skillweave.spaces import ActionCodec, obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array
+
+ONE_ROW = ("recurrent_state", "log_std")
+"""Fields that have one row, whatever the number of rows of the others."""
 
 
 class RolloutStore:
@@ -107,13 +110,21 @@ class RolloutStore:
         """Restore a ``state``, of a learner in these spaces.
 
         Raises:
-            ValueError: the state does not fit; see ``check_held``.
+            RunError: observations or actions have other shapes or types, as spaces have changed.
         """
-        batches: list[dict[str, Tensor]] = []
-        while rows := unprefixed(str(len(batches)), state):
-            batches.append(rows)
-        check_held(batches, self._members, observation_space, codec)
-        self._batches = batches
+        obs = to_tensor(np.zeros((1, *obs_shape(observation_space)), obs_dtype(observation_space)))
+        examples = {"obs": obs, "next_obs": obs, "action": to_tensor(codec.zeros(1))}
+        self._batches = []
+        while rows := unprefixed(str(len(self._batches)), state):
+            for name, example in examples.items():
+                x = rows[name]
+                if x.dtype != example.dtype or x.shape[3:] != example.shape[1:]:
+                    raise RunError(
+                        f"the checkpoint's rows have {name!r} of {x.dtype} {tuple(x.shape[3:])}, "
+                        f"where {example.dtype} {tuple(example.shape[1:])} belongs: the "
+                        "environment has changed since it was written"
+                    )
+            self._batches.append(rows)
 
     def _valid_rows(self) -> int:
         """Return the number of valid rows of the member that has the fewest."""

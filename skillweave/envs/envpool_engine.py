@@ -122,13 +122,7 @@ class EnvPoolEngine(WatchedEngine):
         """Repeat all actions; return observations (N, *obs_shape) and early ends (k,)."""
         self._seeds = [int(seed) for seed in state["seeds"]]
         self._place = state["place"].copy()
-        wrong = self._place.shape != (self.num_envs,) or not 0 < len(self._seeds) < 3
-        if wrong or not ((self._place >= 0) & (self._place < len(self._seeds))).all():
-            raise ValueError("environments are in pools that do not exist")
-        root = state["root"]
-        if root.shape != (2,) or root.dtype.kind != "i" or not (root >= 0).all():
-            raise ValueError("the first seed and the number of pools are no whole numbers")
-        self._root, self._made = (int(x) for x in root)
+        self._root, self._made = (int(x) for x in state["root"])
         self._history.load(state)
         self._pools = [self.make_pool(seed) for seed in self._seeds]
         obs = np.array(self._begin(self._all))

@@ -74,33 +74,19 @@ class History:
         }
 
     def load(self, state: dict[str, Array]) -> None:
-        """Load a history from ``state``.
-
-        Raises:
-            ValueError: it is not a history of N environments.
-        """
-        length = state["length"]
-        action = self._packed(state["action"])
-        begins = state["begins"]
-        fits = length.shape == self.length.shape and length.dtype.kind == "i"
-        if not fits or length.min(initial=0) < 0 or length.sum() != len(action):
-            raise ValueError("lengths and actions of the history do not belong together")
-        if begins.shape[1:] != (2,) or (begins < 0).any() or (begins[:, 0] > length.max()).any():
-            raise ValueError("the history's episodes begin outside its actions")
-        self.length = length.astype(np.int64)
+        """Load a history from ``state``."""
+        self.length = state["length"].copy()
         longest = int(self.length.max(initial=0))
         capacity = max(64, 1 << (longest + 1).bit_length())
         self._action = np.zeros((capacity, *self._action.shape[1:]), self._action.dtype)
         self._begins = np.zeros((capacity, len(self.length)), bool)
         done = np.arange(longest)[:, None] < self.length
-        self._action[:longest][done] = action
-        self._begins[tuple(begins.T)] = True
+        self._action[:longest][done] = self._packed(state["action"])
+        self._begins[tuple(state["begins"].T)] = True
 
     def _packed(self, action: Array) -> Array:
         """Return actions of a file (n, …), where those with parts are bytes (n, K)."""
         dtype = self._action.dtype
         if dtype.fields is None or action.dtype == dtype:
             return action
-        if action.dtype != np.uint8 or action.shape[1:] != (dtype.itemsize,):
-            raise ValueError(f"actions are {action.dtype} {action.shape}, not bytes of {dtype}")
         return np.ascontiguousarray(action).view(dtype).reshape(len(action))

@@ -20,7 +20,6 @@ from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm, state_from
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
-from skillweave.errors import RunError
 from skillweave.evolution.config import Evolution, evolution_from_json
 from skillweave.evolution.population import Population
 from skillweave.evolution.shard import FitnessEnvs, policy_of
@@ -265,10 +264,8 @@ class EvolvingPopulation:
     def _restore(self, tensors: dict[str, Tensor]) -> None:
         """Restore the population from a checkpoint."""
         where = str(self.run.path)
-        name = self.entry.name
         at = self.log.at.population
-        if at is None:
-            raise RunError(f"{where}: the checkpoint of stage {name!r} has no population")
+        assert at is not None
         self.done = at.generation
         self.fitness_steps = at.fitness_steps
         if (best := at.best) is not None:
@@ -283,15 +280,12 @@ class EvolvingPopulation:
         self.population.next_number = at.next_number
 
     def _restored(self, entry: MemberEntry, tensors: dict[str, Tensor], where: str) -> Member:
-        """Return a member of a checkpoint.
-
-        Heirs have parents that had not diverged. The last generation has no heirs.
-        """
+        """Return a member of a checkpoint."""
         config = config_from_json(entry.config)
         algorithm = make_algorithm(config, *self.task.role.spaces)
         like = algorithm.init([self.seeds])
         groups = algorithm.parameter_groups()
-        state = state_from(tensors, like, where, groups, may_diverge=self.over)
+        state = state_from(tensors, like, where, groups)
         return Member(entry.number, config, state, entry.steps, entry.origin)
 
 

@@ -30,7 +30,7 @@ from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Loop, LoopState
 from skillweave.training.periodic import episodes_of
-from skillweave.training.replay_learner import ReplayLearner, check_counts, store_of
+from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.types import Array
 
 OnGenerationTick = Callable[[int, dict[str, float]], None]
@@ -199,8 +199,6 @@ class Shard:
             store: the content of the replay buffer; empty if it has none.
         """
         self._kept = unprefixed("kept", saved)
-        if self._kept:
-            check_counts(self._kept, self.num_envs)
         arrays = {k: v.numpy() for k, v in saved.items()}
         self.episodes.load(unprefixed("episodes", arrays))
         if store:

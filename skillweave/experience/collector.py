@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from skillweave._internal.paths import name_of
 from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds, seed_global_generators
 from skillweave.algorithms.batches import Batch, Trace, padded_last_axis, side_by_side
@@ -17,7 +18,6 @@ from skillweave.envs.env_infos import info_numbers, notice_odd_success, reported
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.acting import Acting, Request
 from skillweave.experience.learners import Alone, Calling, LevelLearners, OneLearner
-from skillweave.experience.restored import OF_LEARNERS, check_numbers, opened
 from skillweave.experience.search import Search
 from skillweave.experience.views import OwnSteps, seen_by, stops
 from skillweave.experience.writer import TraceWriter
@@ -42,6 +42,8 @@ FIRST_INFO = 4
 """The column of the first logged key of ``info``; those of the others follow."""
 PLAYED = 64
 """Steps after which episodes that are played are judged."""
+OF_LEARNERS = {"state_before", "player.rnn", "player.own.rnn", "player.selector.rnn"}
+"""Names in ``Collector.kept`` of the recurrent states of learners: other networks begin afresh."""
 
 
 @dataclass
@@ -123,17 +125,13 @@ class Collector:
             **self.learning.kept,
         }
         """State of each environment between requests, (N, …) each; changed in place."""
-        self.values = prefixed("player", self.policy.values()) | self.learning.values
-        """By names of these, what numbers that choose among something may be, or whose goals."""
         self.after_request = {"sums", *self.learning.kept}
         """Names in ``kept`` that change when the steps of a request are judged, not in a step."""
         if self._goals is not None:
             self.kept["goal"] = self._goals.start(n)
-            self.values["goal"] = self._goals
             self.kept["needs_goal"] = np.ones(n, bool)  # a call starts
         if self.search is not None:
             self.kept |= self.search.kept
-            self.values |= self.search.values
         self._last_actions: Space | None = None  # of the actions, where the last one counts
         if self.policy.holds or (self.search is not None and self.search.holds):
             self._last_actions = space_of(engine.action_space)
@@ -244,33 +242,31 @@ class Collector:
             (k,) environments that start again, as they did not repeat themselves.
 
         Raises:
-            RunError: the state is another collector's.
+            RunError: it has other names, shapes or types, as environment or skills have changed.
         """
         # Environments that draw from global generators go on otherwise than they began.
         seed_global_generators(Seeds(_checksum(state)) / "global")
         kept = unprefixed("kept", state)
         if others := sorted(kept.keys() ^ {*self.kept, "obs"}):
             raise RunError(
-                f"the checkpoint's open episodes differ in {others[0]!r}: it is of another stage "
-                "or another version of Skillweave, or damaged"
+                f"the checkpoint's open episodes differ in {others[0]!r}: the environment, the "
+                "skills or Skillweave have changed since it was written"
             )
         for name, values in self.kept.items():
-            found = kept[name]
-            own = as_numbers(values)
-            if found.shape != own.shape or found.dtype != own.dtype:
-                raise RunError(
-                    f"the checkpoint's {name!r} of open episodes is {found.dtype} {found.shape}, "
-                    f"where {own.dtype} {own.shape} belongs: it is not of this stage, or damaged"
-                )
-            own[:] = found
-        check_numbers(self.kept, self.values)
+            _check_fits(name, kept[name], values)
+            as_numbers(values)[:] = kept[name]
         obs, early = self.engine.restore(unprefixed("engine", state))
         self.obs = np.array(obs)
         self.begun = True
-        space = self.engine.observation_space
         self.open.clear()
-        saved = unprefixed("open", state)
-        self.open |= opened(saved, self.kept, self.obs, space, self.learning.seen_goals)
+        for name, saved in unprefixed("open", state).items():
+            self.open[name] = saved.copy()
+            if name_of(name) == "obs":  # of a hierarchy below: "inner/obs"
+                like = self.obs
+                if (goals := self.learning.seen_goals.get(name)) is not None:
+                    like = goals.join(like, goals.start(len(like)))
+                _check_fits(name, saved, like)
+                self.open[name] = self.open[name].view(like.dtype).reshape(like.shape)
         other = np.flatnonzero(checksums(self.obs) != kept["obs"])
         ids = np.union1d(early, other)
         self._clear(ids)
@@ -537,6 +533,18 @@ class Collector:
 def as_numbers(x: Array) -> Array:
     """Return an array (N, …) as a checkpoint holds it, the same memory: records as bytes."""
     return x if x.dtype.names is None else x.view(np.uint8).reshape(len(x), -1)
+
+
+def _check_fits(name: str, saved: Array, like: Array) -> None:
+    """Raise a RunError where an array of a checkpoint has another shape or type than ``like``."""
+    found = as_numbers(saved)
+    own = as_numbers(like)
+    if found.shape != own.shape or found.dtype != own.dtype:
+        raise RunError(
+            f"the checkpoint's {name!r} of open episodes is {found.dtype} {found.shape}, where "
+            f"{own.dtype} {own.shape} belongs: the environment, the skills or Skillweave have "
+            "changed since it was written"
+        )
 
 
 def _checksum(state: Mapping[str, Array]) -> int:

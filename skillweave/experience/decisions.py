@@ -10,7 +10,6 @@ import numpy as np
 from skillweave._internal.paths import SELECTOR
 from skillweave.algorithms.batches import Batch, Trace, padded_last_axis
 from skillweave.experience.levels import LearningLevel
-from skillweave.experience.restored import known
 from skillweave.policies.hierarchy import unless_none
 from skillweave.policies.parts import OBSERVATION
 from skillweave.types import Array
@@ -192,7 +191,8 @@ class OpenCalls:
         values: Array | None = trace.get(f"{self.level.path}{SELECTOR}/{name}")
         if values is None or name not in ("dist_params", "state_before"):
             return values
-        return known(values)  # of a member that has diverged, it may be NaN
+        # Of a member that has diverged it may be NaN: its heir goes on with the open calls.
+        return np.where(np.isnan(values), np.float32(0), values)
 
     def _held(self, name: str) -> Array | None:
         """Return a column (N, …) of the decisions whose calls were open before; None: none was."""

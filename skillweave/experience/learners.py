@@ -98,7 +98,6 @@ class OneLearner:
         self.memory = self.policy.start(engine.num_envs)
         self._state: Array | None = own_memory(self.memory).get("rnn")
         self.kept: dict[str, Array] = {}
-        self.values: dict[str, Any] = {}
         self.seen_goals: dict[str, Goals] = {}
         self.whole = True
         self.overrides = bool(who.reflexes)
@@ -179,8 +178,6 @@ class LevelLearners:
         """It counts for them where reflexes act."""
         self.kept: dict[str, Array] = {}
         """Arrays (N, …) that change when the steps of a request are judged."""
-        self.values: dict[str, Any] = {}
-        """As of ``Collector``."""
         self.seen_goals: dict[str, Goals] = {}
         """By names of open calls' observations, the goals that stand in them."""
         self._open: dict[str, OpenCalls] = {}  # by the paths of levels whose selectors learn
@@ -193,8 +190,6 @@ class LevelLearners:
                 if level.goals is not None:
                     self.seen_goals[f"{level.path}obs"] = level.goals
                 self.kept |= {level.path + name: value for name, value in calls.kept.items()}
-                if "action" in calls.kept:
-                    self.values[f"{level.path}action"] = range(level.hierarchy.choices)
 
     def begin(self, request: Request, elapsed: Array) -> None:
         """Act by a request from now on; ``elapsed`` (N,) are steps of the episodes so far."""

@@ -7,11 +7,9 @@ while it acts in the others.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from skillweave._internal.prefixes import prefixed
 from skillweave.envs.engine import Engine
 from skillweave.envs.env_infos import allowed_rows, random_actions
 from skillweave.errors import TrainingError
@@ -103,8 +101,6 @@ class Search:
         if self._named:
             self.kept["named"] = np.zeros(n, bool)  # the last of these calls must be named
             self.kept["sought"] = np.zeros(n, np.int64)  # steps until one ended; −1: one has
-        self.values: dict[str, Any] = {}
-        """As of ``Collector``."""
         self.holds = False
         """The last action counts for who is called."""
         if starts.skills is not None:
@@ -114,7 +110,6 @@ class Search:
             self._hierarchy = within(self._policy)
             self.memory = self._policy.start(n)
             self.kept |= flat(self.memory, "starters.")
-            self.values = prefixed("starters", self._policy.values())
             self.holds = self._policy.holds
 
     def playing(self, obs: Array, world: World) -> tuple[Array, Array]:

@@ -98,4 +98,5 @@ class _Uncopied:
             "after the steps of a round: let the environment set numbers or arrays there"
         )
 
-    __getattr__ = __getitem__ = __array__ = __iter__ = __len__ = _refuse
+    __getitem__ = _refuse  # iteration uses it, too
+    __getattr__ = _refuse  # so does NumPy, which looks for ``__array__``

@@ -290,13 +290,6 @@ class RowPolicy:
             where: begins the message.
         """
 
-    def values(self) -> dict[str, Any]:
-        """Return what numbers in its memory may be, by dotted name: a range, or has ``contains``.
-
-        Of what users remember nothing is known.
-        """
-        return {}
-
 
 @dataclass(eq=False)
 class Around(RowPolicy):

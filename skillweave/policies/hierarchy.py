@@ -28,7 +28,6 @@ from .core import (
     OWN,
     RUNNING,
     Array,
-    CallEnd,
     CallUser,
     Choices,
     LastCall,
@@ -114,10 +113,6 @@ class CallGoals:
         with suppress(Exception), np.errstate(all="ignore"):
             return np.array(ends(still), bool).reshape(len(obs))
         return no
-
-    def contains(self, goal: Array) -> bool:
-        """Return whether all goals (n, *goal_shape) are in the space."""
-        return bool(self.space.holds(goal).all())
 
 
 @dataclass(eq=False)
@@ -628,21 +623,6 @@ class CallAndReturn(Choices, RowPolicy):
         for i, skill in enumerate(self.skills):
             own = None if skill.goals is None else skill.goals.space
             skill.policy.check(sees, acts, own, f"{where}.skills[{i}].policy")
-
-    def values(self) -> dict[str, Any]:
-        """Return what numbers in its memory may be, by dotted name."""
-        found: dict[str, Any] = {
-            "skill": range(-1, len(self.skills)),
-            "elapsed": range(2**31),
-            "end": range(len(CallEnd)),
-        }
-        if self.lengths:
-            found["length"] = range(max(self.lengths) + 1)
-        found |= {f"goal.{i}": goals for i, goals in self.goals.items()}
-        parts = {str(i): skill.policy for i, skill in enumerate(self.skills)}
-        for name, part in {**parts, **self._ready}.items():
-            found |= {f"{name}.{k}": v for k, v in part.values().items()}
-        return found
 
 
 def _by_skill(running: Array) -> Iterator[tuple[int, Array]]:

@@ -121,11 +121,6 @@ class Corrects(Around):
         self.policy.observe(memory["own"], rows, step)
         self.base.observe(memory["base"], rows, step)
 
-    def values(self) -> dict[str, Any]:
-        """Return what numbers in the memories of both may be."""
-        both = {"own": self.policy.values(), "base": self.base.values()}
-        return {f"{name}.{k}": v for name, each in both.items() for k, v in each.items()}
-
 
 @dataclass(eq=False)
 class Slice:

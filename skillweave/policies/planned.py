@@ -120,13 +120,6 @@ class Planned(Rule):
         if not same and (self.goals or acts.parts or sum(acts.counts) % self.count):
             raise PolicyError(f"{where} makes choices of {self._choices}, but is used for {acts}")
 
-    def values(self) -> dict[str, Any]:
-        """Return the ranges of the task's states, and of choices."""
-        return {
-            "state": range(len(self.task.each)),
-            "tried.choice": range(-1, self.count),
-        }
-
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return choices (k,); where it has ``goals``, they have goals."""
         option, near = self.decide(memory, rows, obs, turn, bool(self.goals))

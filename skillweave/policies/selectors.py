@@ -412,10 +412,6 @@ class StateMachine(Rule):
             waits &= ~taken
         memory["state"][rows] = after
 
-    def values(self) -> dict[str, Any]:
-        """Return the range of the states."""
-        return {"state": range(len(self.states))}
-
 
 # A behaviour tree -------------------------------------------------------------------------------
 
@@ -544,10 +540,6 @@ class Tree(Rule):
         called = self.skill_of[memory["leaf"][rows]] == last.skill
         memory["leaf"][rows[over & ~called]] = -1
         memory["succeeded"][rows[over]] = last.succeeded[over]
-
-    def values(self) -> dict[str, Any]:
-        """Return the range of the leaves, with −1 for none."""
-        return {"leaf": range(-1, len(self.skill_of))}
 
 
 class _Tick:

@@ -477,6 +477,7 @@ def wandb_mode() -> Any:
 
 
 def _has_netrc() -> bool:
+    """Return whether ``wandb login`` has stored a key: without one, W&B asks for it and waits."""
     try:
         with open(os.path.expanduser("~/.netrc")) as file:
             return "api.wandb.ai" in file.read()

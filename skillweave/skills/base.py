@@ -37,7 +37,6 @@ from skillweave.skills.spelling import misspelt
 from skillweave.types import Array, Step
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
-DEVICE = re.compile(r"con|prn|aux|nul|com\d|lpt\d", re.IGNORECASE)
 """Valid names of skills, which are also names of files."""
 
 
@@ -55,8 +54,8 @@ Color = Annotated[
     Any,
     Check(
         "red, green and blue, each from 0 to 255: color = (230, 80, 60)",
-        lambda x: len(x) == 3,
-        lambda x: bytes(list(x)),  # which takes no other numbers
+        lambda x: len(x) == 3 and all(isinstance(c, int | np.integer) and 0 <= c <= 255 for c in x),
+        list,
     ),
 ]
 """Red, green and blue."""
@@ -220,11 +219,6 @@ class Skill:
             raise DeclarationError(
                 f"{where}: the name names files too; use letters, digits, '_' and '-', at most 64"
             )
-        if DEVICE.fullmatch(self.name):
-            raise DeclarationError(
-                f"{where}: the name names files too, and {self.name!r} is a device on Windows; "
-                "choose another name"
-            )
         kinds = annotations_of(Skill)
         for field in ("color", "goal_space"):
             fitted(kinds[field], getattr(self, field), f"{where}: {field}")
@@ -243,7 +237,8 @@ class Skill:
             declared_sees(self.sees, where)
         if self.acts is not None:
             declared_acts(self.acts, where)
-        for name, meant in misspelt(self, Skill, (*FIELDS, *self.methods, *self.of_goals)):
+        known = (*FIELDS, *self.methods, *self.of_goals, "Hierarchy.rest")
+        for name, meant in misspelt(self, Skill, known):
             code = getattr(getattr(self, name), "__code__", None)
             line = code and f" ({Path(code.co_filename).name}, line {code.co_firstlineno})"
             warnings.warn(

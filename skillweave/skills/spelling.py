@@ -7,54 +7,10 @@ import types
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
+from skillweave._internal.messages import ELSEWHERE
+
 SIMILAR = 0.9
 """The least similarity of a name to the attribute that it resembles, as ``difflib``'s ratio."""
-
-METHODS = {
-    "available": "initiation",
-    "can_start": "initiation",
-    "compute_reward": "reward",
-    "condition": "initiation",
-    "done": "termination",
-    "get_reward": "reward",
-    "init_set": "initiation",
-    "initial": "initiation",
-    "initiate": "initiation",
-    "is_done": "termination",
-    "is_success": "success",
-    "is_terminal": "termination",
-    "is_terminated": "termination",
-    "may_start": "initiation",
-    "precondition": "initiation",
-    "reward_fn": "reward",
-    "reward_function": "reward",
-    "should_stop": "termination",
-    "solved": "success",
-    "stop": "termination",
-    "succeeded": "success",
-    "terminate": "termination",
-    "terminated": "termination",
-    "act": "policy",
-    "predict": "policy",
-}
-"""Names of a skill's methods in other libraries, with the names of this library."""
-
-VALUES = {
-    "act": "acts",
-    "actions": "acts",
-    "observes": "sees",
-    "reads": "sees",
-    "rest": "Hierarchy.rest",
-    "see": "sees",
-    "writes": "acts",
-    "max_episode_steps": "max_steps",
-    "time_limit": "max_steps",
-    "timeout": "max_steps",
-    "total_timesteps": "steps",
-    "training_steps": "steps",
-    "colour": "color",
-}
-"""Attributes that are not methods, by names that people write for them."""
 
 
 def misspelt(skill: Any, base: type, known: Iterable[str]) -> Iterator[tuple[str, str]]:
@@ -65,20 +21,20 @@ def misspelt(skill: Any, base: type, known: Iterable[str]) -> Iterator[tuple[str
     Args:
         skill: an instance of a subclass of ``base``.
         base: the class ``Skill``.
-        known: the attributes that a skill may define.
+        known: the attributes that a skill may define, and what is meant instead.
     """
     known = list(known)
     kinds = type(skill).__mro__[: type(skill).__mro__.index(base)]
     declared = {k: v for kind in reversed(kinds) for k, v in vars(kind).items()} | vars(skill)
     used = set().union(*(_used(v) for v in declared.values()))
-    for name, value in declared.items():
+    for name in declared:
         if name.startswith("_") or name in dir(base):
             continue
         near = difflib.get_close_matches(name, known, n=1, cutoff=SIMILAR)
-        elsewhere = (METHODS if callable(value) else VALUES).get(name)
+        elsewhere = ELSEWHERE.get(name)
         if near:
             yield name, near[0]
-        elif elsewhere is not None and name not in used:
+        elif elsewhere in known and name not in used:
             yield name, elsewhere
 
 

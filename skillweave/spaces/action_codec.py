@@ -10,7 +10,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 from torch import Tensor
 
 from skillweave._internal.messages import short
@@ -101,13 +100,6 @@ class ActionCodec:
         if not self.discrete:
             return np.zeros((*lead, self.size), np.float32)
         return np.zeros((*lead, *([len(self.parts)] if self.multi else [])), np.int64)
-
-    def check(self, action: Tensor) -> None:
-        """Raise a ValueError where actions in policy units (…) are not in this space."""
-        if self.discrete:
-            most = torch.tensor(self.parts if self.multi else self.parts[0], device="cpu")
-            if not bool(((action >= 0) & (action < most.to(action.device))).all()):
-                raise ValueError("an action of its rows does not exist")
 
     def _shaped(self, action: Array) -> Array:
         shaped = action.reshape(len(action), *(self.space.shape or ()))
@@ -200,16 +192,6 @@ class JointCodec(ActionCodec):
         for (name, codec), columns in zip(self.members, self.mask_columns, strict=True):
             drawn[name] = codec.allowed_at_random(action[name], mask[:, columns], rng)
         return drawn
-
-    def check(self, action: Tensor) -> None:
-        """Raise a ValueError where actions in policy units (…, size) are not in this space."""
-        if not bool(action.isfinite().all()):
-            raise ValueError("an action of its rows is not finite")
-        for at, (_, codec) in enumerate(self.members):
-            part = action[..., self.columns[at]]
-            if codec.discrete and not bool((part == part.trunc()).all()):
-                raise ValueError("an action of its rows does not exist")
-            codec.check(self.units(action, at))
 
 
 def action_codec(space: gym.Space[Any]) -> ActionCodec:

@@ -207,29 +207,6 @@ class ObsCodec:
         nothing = raw[0].new_empty((*lead, 0), dtype=torch.float32)
         return torch.cat(vectors, dim=-1) if vectors else nothing, tuple(images)
 
-    @property
-    def may_be_wrong(self) -> bool:
-        """Return whether ``check`` can fail: any bytes of an image are valid, for example."""
-        return any(leaf.choices or leaf.dtype.is_floating_point for leaf in self.leaves)
-
-    def check(self, obs: Tensor) -> None:
-        """Raise a ValueError where raw observations (*lead, *item) are not in this space.
-
-        They have a number that is not finite, or a choice that does not exist.
-        """
-        for leaf in self.leaves:
-            x = leaf.read(obs)
-            if x.is_floating_point() and not bool(x.isfinite().all()):
-                raise ValueError("an observation is not finite")
-            if leaf.choices:
-                flat = x.reshape(-1, len(leaf.choices)).long() - torch.tensor(
-                    leaf.start, device="cpu"
-                )
-                if not bool(
-                    ((flat >= 0) & (flat < torch.tensor(leaf.choices, device="cpu"))).all()
-                ):
-                    raise ValueError("an observation holds a choice that does not exist")
-
     def highest(self, i: int) -> Tensor:
         """Return the highest number of each pixel of image ``i``, (C, H, W), in its dtype."""
         leaf = [leaf for leaf in self.leaves if leaf.image is not None][i]

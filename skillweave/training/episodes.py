@@ -88,8 +88,6 @@ class Episodes:
     def load(self, state: dict[str, Array]) -> None:
         """Restore a ``state``."""
         for name, window in self._windows.items():
-            if state[name].ndim != 1 or not np.isfinite(state[name]).all():
-                raise ValueError(f"{name} of the latest episodes is no row of numbers")
             window.clear()
             window.extend(state[name].tolist())
 

@@ -12,7 +12,6 @@ from skillweave._internal.paths import CRITIC, SELECTOR, decides, join, name_of,
 from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave.algorithms.batches import Batch
 from skillweave.buffers.rollout import RolloutStore
-from skillweave.errors import RunError
 from skillweave.experience.acting import Request
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import normalize
@@ -126,11 +125,7 @@ class JointLearner:
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """Restore the tensors that ``kept`` returned."""
-        counts = kept["counts"]
-        fits = counts.shape == (len(self.counts), 2) and counts.dtype == torch.int64
-        if not fits or not ((counts >= 0) & (counts < 2**53)).all():
-            raise RunError("its counts of rows and updates are out of range")
-        self.counts = dict(zip(self.counts, counts.tolist(), strict=True))
+        self.counts = dict(zip(self.counts, kept["counts"].tolist(), strict=True))
         for name, learner in self.learners.items():
             learner.load(unprefixed(name, kept))
 

@@ -201,7 +201,6 @@ class ReplayLearner:
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """Restore the tensors of a checkpoint."""
-        check_counts(kept, self.store.num_envs)
         self._transitions = kept["transitions"].numpy().copy()
         if "returns" in kept:
             self._returns = kept["returns"].numpy().copy()
@@ -221,24 +220,6 @@ class ReplayLearner:
         """Return the columns of a stack's members."""
         each = self.store.num_envs // self.members
         return slice(self._first[stack] * each, self._first[stack + 1] * each)
-
-
-def check_counts(kept: dict[str, Tensor], num_envs: int) -> None:
-    """Raise a ValueError where a checkpoint's ``ReplayLearner.counts`` are invalid."""
-    counts = kept["transitions"]
-    if counts.shape != (2,) or counts.dtype != torch.float64:
-        raise ValueError(f"the number of its transitions is {counts.dtype} {tuple(counts.shape)}")
-    # A checkpoint is made right after learning, so both counts are equal.
-    learnt, now = counts.tolist()
-    if learnt != now or not 0.0 <= now < 2.0**53:
-        raise ValueError(f"it has learnt from {learnt} of {now} transitions: they must be equal")
-    returns = kept.get("returns")
-    if returns is not None and (
-        returns.shape != (num_envs,)
-        or returns.dtype != torch.float32
-        or not bool(returns.isfinite().all())
-    ):
-        raise ValueError("the returns of its open episodes are no row of numbers")
 
 
 def store_of(

@@ -302,15 +302,12 @@ def resumed(log: StageLog, restore: Callable[[], T]) -> T:
     """Restore environments from a checkpoint by ``restore``; errors name the run and the stage.
 
     Raises:
-        RunError: the content of the checkpoint is wrong.
+        RunError: the checkpoint has other names or shapes, as the program has changed.
     """
+    where = f"{log.run.path}: stage {log.entry.name!r}"
     try:
         return restore()
     except SkillweaveError as error:
-        run = str(log.run.path)
-        raise error if run in str(error) else reworded(error, f"{run}: {error}") from error
-    except (KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError) as error:
-        raise RunError(
-            f"{log.run.path}: training cannot continue from the checkpoint of stage "
-            f"{log.entry.name!r}: {error!r}"
-        ) from error
+        raise reworded(error, f"{where}: {error}") from error
+    except (KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
+        raise RunError(f"{where} cannot continue from its checkpoint: {error!r}") from error

@@ -12,8 +12,7 @@ from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import SelfImitationPPO
 from skillweave.algorithms.batches import Rollout
 from skillweave.algorithms.registry import make_algorithm
-from skillweave.errors import DeclarationError, RunError
-from skillweave.training.learner import Stack
+from skillweave.errors import DeclarationError
 
 SEEN, THREE = Box(-1.0, 1.0, (2,), np.float32), Discrete(3)
 CONFIG = SelfImitationPPO(
@@ -171,19 +170,6 @@ def test_a_few_rows_are_not_learnt_by_heart(batch, most, steps):
     algorithm.keep(state, rollout([[0.0, 0.0, 0.0, 3.0]], ends=[(3, 0)]))
     algorithm.imitate(state, state.learning_rate, rngs())
     assert state.count.tolist() == [steps]
-
-
-def test_what_was_kept_is_looked_at_before_it_is_learnt_from():
-    algorithm, state = make()
-    Stack(algorithm, state)
-    state.kept_action[0, 0] = 3
-    with pytest.raises(RunError, match=r"SelfImitationPPO has kept .* action .* altered"):
-        Stack(algorithm, state)
-    grid = make_algorithm(CONFIG, Discrete(4), THREE)
-    state = grid.init([Seeds(0)])
-    state.kept_obs.fill_(4)
-    with pytest.raises(RunError, match="choice that does not exist"):
-        Stack(grid, state)
 
 
 def test_memory_is_refused():

@@ -8,6 +8,7 @@ from hypothesis import given, settings, strategies as st
 
 from skillweave.algorithms.batches import Batch, Rollout
 from skillweave.buffers.rollout import RolloutStore
+from skillweave.errors import RunError
 from skillweave.spaces import action_codec, obs_dtype
 
 T, P, B, A, M = 3, 2, 2, 3, 5
@@ -320,3 +321,18 @@ def test_a_state_goes_on_exactly_and_is_a_copy():
     e["recurrent_state"][:] += 99
     assert (state["0.recurrent_state"] < 99).all()
     assert RolloutStore(1).state() == {}
+
+
+@pytest.mark.parametrize(
+    ("space", "codec", "name"),
+    [
+        (gym.spaces.Box(-1, 1, (2,), np.float64), CODEC, "obs"),
+        (gym.spaces.Box(-1, 1, (3,)), CODEC, "obs"),
+        (SPACE, action_codec(gym.spaces.Box(-1, 1, (2,))), "action"),
+    ],
+)
+def test_rows_of_other_spaces_are_not_loaded(space, codec, name):
+    store = RolloutStore(P)
+    store.add(experience())
+    with pytest.raises(RunError, match=f"rows have {name!r} .* environment has changed"):
+        RolloutStore(P).load(store.state(), space, codec)

@@ -14,7 +14,6 @@ def named(name) -> Skill:
 
 REFUSED = {
     "which names a stage": ["Selector", "TOGETHER", "Agent", "Skill_Critic"],
-    "is a device on Windows": ["con", "NUL", "aux", "Com1", "lpt9"],
     "use letters, digits, '_' and '-', at most 64": [
         "a/b", "..", "left.", "left ", "a\\b", "x" * 65, "größe", "a\0b", "-left", "left\n",
     ],

@@ -246,15 +246,6 @@ def test_what_does_not_fit_the_spaces(sees, acts, rest, space, says):
         part(sees, acts, rest, space)
 
 
-@pytest.mark.parametrize(
-    ("attributes", "meant"),
-    [({"act": 0}, "acts"), ({"see": "arm"}, "sees"), ({"acts": 0, "rest": 0.0}, "Hierarchy.rest")],
-)
-def test_a_misspelt_part_is_noticed(attributes, meant):
-    with pytest.warns(UserWarning, match=f"is '{meant}' meant"):
-        mine(**attributes).validate()
-
-
 def test_a_function_that_gives_no_number_is_an_error():
     own = part(("hook", lambda obs: np.where(obs["hook"] == 0.0, np.inf, obs["arm"])))
     obs = observations()

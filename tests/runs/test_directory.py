@@ -20,19 +20,15 @@ from small_runs import level_entry, small_manifest
 from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy, make_algorithm, state_from
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm, state_from
 from skillweave.algorithms.config import PPO, config_to_json
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_header, read_json, read_tensors, write_json, write_tensors
 from skillweave.runs.manifest import (
-    BestEntry,
     Checkpoint,
-    Generation,
     Manifest,
-    MemberEntry,
-    Origin,
     SkillEntry,
     StageEntry,
     versions,
@@ -548,16 +544,6 @@ def test_a_checkpoint_of_other_shapes_or_types_is_refused_by_tensor(
         loaded(run, Learnt(weight, state.count))
 
 
-def test_a_checkpoint_with_a_damaged_header_falls_back_to_the_one_before(
-    run: RunDirectory,
-) -> None:
-    save(run, 1)
-    save(run, 2)
-    tensors, header = read_tensors(run.path / "checkpoint.safetensors")
-    write_tensors(run.path / "checkpoint.safetensors", tensors, header | {"steps": "many"})
-    assert loaded(run).update == 1
-
-
 # One process at a time, and what a killed one leaves
 
 
@@ -700,23 +686,6 @@ def test_a_checkpoint_that_cannot_be_renamed_is_an_error_for_people(
     monkeypatch.undo()
     loaded(run, kept)
     assert not (run.path / "checkpoint.new.safetensors").exists()
-
-
-@pytest.mark.parametrize("field", ["members", "best", "generation"])
-def test_a_populations_checkpoint_without_one_of_its_fields_is_refused(
-    run: RunDirectory, field: str
-) -> None:
-    member = MemberEntry(0, 1, ALGORITHM, Origin(changes={"gamma": (0.9, 0.99)}))
-    population = Generation(0, 1, 0, 1, [member], BestEntry(1.0, 0, 0, AgentHeader({}, {}, {})))
-    saved = Checkpoint("landing", 1, 1, 0, 0.0, {}, population=population)
-    run.save_checkpoint(saved, vars(learnt(1)))
-    assert loaded(run).population == population
-    path = run.path / "checkpoint.safetensors"
-    tensors, header = read_tensors(path)
-    del header["population"][field]
-    write_tensors(path, tensors, header)
-    with pytest.raises(RunError, match=f"damaged: population has no field '{field}'"):
-        run.load_checkpoint("landing")
 
 
 def test_a_folder_that_is_no_utf8_is_refused_before_training(tmp_path: Path) -> None:

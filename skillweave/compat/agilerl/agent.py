@@ -13,7 +13,13 @@ import numpy as np
 import torch
 
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy, make_algorithm, state_from
+from skillweave.algorithms.agent_policy import (
+    AgentHeader,
+    AgentPolicy,
+    check_finite,
+    make_algorithm,
+    state_from,
+)
 from skillweave.algorithms.batches import Sample
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.mutation import with_settings
@@ -269,6 +275,7 @@ class AgilerlAgent:
         if saved:
             saved = vars(state) | saved
             state = state_from(saved, state, str(path), learner.parameter_groups())
+            check_finite(vars(state), str(path))
         spaces = learner.observation_space, learner.action_space
         self.take(Member(0, learner.config, state), spaces, seeds)
         self.__dict__.update(past)
