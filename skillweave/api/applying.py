@@ -20,10 +20,10 @@ from skillweave.hierarchy.recorded import (
     with_entry,
 )
 from skillweave.hierarchy.roles import Level, Roles, roles_of
-from skillweave.reporting.report.facts import plain, settings
+from skillweave.reporting.report.facts import plain
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import Manifest, SkillEntry
+from skillweave.runs.manifest import Manifest, SkillEntry, settings_of
 from skillweave.runs.user_code import environment_texts, notice_changes
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import other_goals
@@ -123,8 +123,8 @@ def differences(content: Manifest, run: RunDirectory, *, budgets: bool = True) -
         content: the manifest that a new run would have.
         budgets: compare the steps of stages, too.
     """
-    here = settings(content)
-    there = settings(run.manifest)
+    here = settings_of(content)
+    there = settings_of(run.manifest)
     if not budgets:
         here = {k: v for k, v in here.items() if not k.endswith(".budget")}
     evolve = tuple(f"{s.name}." for s in run.manifest.stages if s.evolution)
@@ -133,12 +133,15 @@ def differences(content: Manifest, run: RunDirectory, *, budgets: bool = True) -
     # Greediness that this declaration leaves open cannot differ.
     greedy = ("greedy_skills", "greedy_selector")
     unset = {k for k in both if k.endswith(greedy) and here[k] is None}
-    differ = [k for k in both if k not in unset and plain(here[k]) != plain(there[k])]
+    differ = [k for k in both if k not in unset and here[k] != there[k]]
     if not differ:
         return ""
-    named = [
-        f"{k} is {plain(there[k])} (declared now: {plain(here[k])})" for k in differ[:MOST_NAMED]
-    ]
+    named = []
+    for name in differ[:MOST_NAMED]:
+        then, now = plain(there[name]), plain(here[name])
+        if then == now:  # they differ in digits that people do not read
+            then, now = repr(there[name]), repr(here[name])
+        named.append(f"{name} is {then} (declared now: {now})")
     more = f", and {len(differ) - MOST_NAMED} more differ" if len(differ) > MOST_NAMED else ""
     return f"the run continues with its own settings: {', '.join(named)}{more}"
 

@@ -48,6 +48,7 @@ from skillweave.reporting.report.timelines import (
 )
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
+from skillweave.runs.manifest import settings_of
 from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
@@ -265,7 +266,7 @@ def _add_words(page: Page, run: RunDirectory, reached: Mapping[str, int]) -> Non
         "kind": "plain agent" if manifest.hierarchy is None else "hierarchy",
         "facts": facts.facts(run),
         "stages": facts.stage_rows(run, reached),
-        "settings": [(k, facts.plain(v)) for k, v in facts.settings(manifest).items()],
+        "settings": [(k, facts.plain(v)) for k, v in settings_of(manifest).items()],
         "steps": sum(
             reached.get(entry.name, 0) if entry.steps is None else entry.steps
             for entry in manifest.stages
