@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from skillweave.errors import SkillweaveError as SkillweaveError
     from skillweave.hierarchy.settings import Apart as Apart, Guide as Guide, Selection as Selection
     from skillweave.networks.config import CNN as CNN, RNN as RNN, Network as Network
+    from skillweave.policies.core import Step as Step
     from skillweave.reporting.curves_figure import plot_curves as plot_curves
     from skillweave.skills import (
         Reflex as Reflex,
@@ -52,7 +53,6 @@ if TYPE_CHECKING:
     from skillweave.training.defaults import TrainDefaults as TrainDefaults
     from skillweave.training.evaluation import evaluate as evaluate
     from skillweave.training.stage import Together as Together
-    from skillweave.types import Step as Step
     from skillweave.workers.cluster import Ray as Ray
 else:
     __all__, __getattr__, __dir__ = lazy(__name__)

@@ -22,6 +22,7 @@ PUBLIC = {
         "errors": "SkillweaveError",
         "hierarchy.settings": "Apart Guide Selection",
         "networks.config": "CNN Network RNN",
+        "policies.core": "Step",
         "reporting.curves_figure": "plot_curves",
         "skills": "Reflex Residual Skill from_function from_onnx from_sb3 from_torch tree",
         "skills.automaton": "Automaton",
@@ -29,7 +30,6 @@ PUBLIC = {
         "training.defaults": "TrainDefaults",
         "training.evaluation": "evaluate",
         "training.stage": "Together",
-        "types": "Step",
     },
     "skillweave.algorithms": {
         "algorithms.base": "ActingParams AgentState Algorithm",
@@ -62,10 +62,10 @@ PUBLIC = {
         "export.write": "Export",
         "hierarchy.policy": "HierarchyPolicy",
         "policies.core": "Array LastCall",
+        "_internal.policy_protocol": "Policy",
         "_internal.seeding": "Seeds",
         "training.callback": "TrainEvent",
         "training.evaluation": "Evaluation",
-        "types": "Policy",
     },
 }
 """By module that users import from: the names of each module of the library."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from skillweave._internal.notices import notice
+from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import AgentHeader
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
@@ -29,7 +30,6 @@ from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import other_goals
 from skillweave.spaces import space_from_json
 from skillweave.training.plain_agent import Declared, load_agent_of
-from skillweave.types import Policy
 
 MOST_NAMED = 3
 """Settings that a message names."""

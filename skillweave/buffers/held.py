@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.policies.core import Array
 from skillweave.spaces import ActionCodec, ObsCodec, obs_codec, obs_dtype, obs_shape, to_tensor
-from skillweave.types import Array
 
 DTYPES = {
     "reward": torch.float32,

@@ -12,8 +12,8 @@ from torch import Tensor
 from skillweave._internal.prefixes import unprefixed
 from skillweave.algorithms.batches import SCHEMA, Batch, Reference, Rollout, column
 from skillweave.buffers.held import ONE_ROW, check_held
+from skillweave.policies.core import Array
 from skillweave.spaces import ActionCodec, to_tensor
-from skillweave.types import Array
 
 
 class RolloutStore:

@@ -11,7 +11,7 @@ from skillweave._internal.seeding import Seeds
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.acting import Request
 from skillweave.experience.collector import Collected, Collector, joined_collected
-from skillweave.types import Array
+from skillweave.policies.core import Array
 
 MakeCollector = Callable[[int, int], Collector]
 """Given how many environments and the number of the first one, makes a collector."""

@@ -9,11 +9,11 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.paths import join, level_of, name_of
-from skillweave.policies.core import RUNNING
+from skillweave._internal.policy_protocol import Memory
+from skillweave.policies.core import RUNNING, Array
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.goals import Goals
 from skillweave.spaces import obs_codec, to_tensor
-from skillweave.types import Array, Memory
 
 COUNTS = range(-1, 2**31)
 """What a number of steps or calls may be."""

@@ -27,10 +27,10 @@ from skillweave.algorithms.batches import Batch
 from skillweave.experience.group import Collectors
 from skillweave.ops.device import INT
 from skillweave.ops.threads import WorkThread, torch_threads
+from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, Tick, to_numbers
 from skillweave.training.learner import Learner, crossed
-from skillweave.types import Array
 
 CHECKPOINT_SECONDS = 60.0
 """Age of the latest checkpoint in seconds at which the next one is written."""

@@ -22,7 +22,7 @@ from skillweave.errors import SkillweaveError, TrainingError, kind_of, reworded
 from skillweave.experience.acting import Request
 from skillweave.experience.collector import Collected
 from skillweave.experience.group import Collectors, joined_states, split_states
-from skillweave.types import Array
+from skillweave.policies.core import Array
 
 SNAPSHOT_EVERY = 16
 """Requests after which workers say where they stand, so that less need be done again."""

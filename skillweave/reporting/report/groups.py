@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from skillweave.errors import DeclarationError
+from skillweave.policies.core import Array
 from skillweave.reporting.report import facts
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import settings_of
 from skillweave.training.evaluation import interquartile_means
-from skillweave.types import Array
 
 
 @dataclass

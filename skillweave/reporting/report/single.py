@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave._internal.paths import AGENT
+from skillweave._internal.policy_protocol import Policy
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.envs.make import EnvSpec
 from skillweave.planning.columns import ENDS
@@ -57,7 +58,6 @@ from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 from skillweave.training.play import PlayedStep as PlayedStep
 from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 from skillweave.training.skill_report import levels_of, skill_rows
-from skillweave.types import Policy
 
 EPISODES = 20
 """Episodes that a report plays by default."""
