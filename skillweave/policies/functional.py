@@ -86,10 +86,13 @@ class Functional:
 
     @property
     def is_plain(self) -> bool:
-        """It acts as ``in_place`` does: no subclass has another way."""
+        """It acts as ``in_place`` does: its class replaces neither start, act nor observe."""
         kind = type(self)
-        own = (kind.start, kind.act, kind.observe)
-        return own == (Functional.start, Functional.act, Functional.observe)
+        return (
+            kind.start is Functional.start
+            and kind.act is Functional.act
+            and kind.observe is Functional.observe
+        )
 
 
 class Returns(RowPolicy):
