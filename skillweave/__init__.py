@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from skillweave.errors import SkillweaveError as SkillweaveError
     from skillweave.hierarchy.settings import Apart as Apart, Guide as Guide, Selection as Selection
     from skillweave.networks.config import Network as Network
+    from skillweave.policies.core import Step as Step
     from skillweave.skills import (
         Reflex as Reflex,
         Residual as Residual,
@@ -56,6 +57,5 @@ if TYPE_CHECKING:
     from skillweave.training.defaults import TrainDefaults as TrainDefaults
     from skillweave.training.evaluation import evaluate as evaluate
     from skillweave.training.stage import Together as Together
-    from skillweave.types import Step as Step
 else:
     __all__, __getattr__, __dir__ = lazy(__name__)

@@ -17,7 +17,6 @@ from skillweave.cli import main
 from skillweave.errors import RunError
 from skillweave.experience.acting import Acting
 from skillweave.hierarchy import training
-from skillweave.reporting.report.facts import settings
 from skillweave.runs import directory
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors, write_tensors
@@ -26,6 +25,7 @@ from skillweave.runs.initial_policies import (
     learners_of_run,
     record_initial_policies,
 )
+from skillweave.runs.manifest import settings_of
 from skillweave.training.joint import JointLearner
 
 STILL = 1e-12
@@ -228,9 +228,9 @@ def test_seeds_that_start_from_runs_of_their_own_are_one_group(tmp_path):
     for seed in range(2):
         first = agent.train(tmp_path / f"first-{seed}", seed=seed, quiet=True)
         run = agent.train(tmp_path / f"then-{seed}", seed=seed, quiet=True, start_from=first)
-        found.append(settings(manifest_of(run.path)))
+        found.append(settings_of(manifest_of(run.path)))
     assert found[0] == found[1]
-    assert found[0] != settings(manifest_of(first.path))
+    assert found[0] != settings_of(manifest_of(first.path))
 
 
 @pytest.mark.slow

@@ -27,7 +27,7 @@ class Seeds:
     """A node of the seed tree; ``Seeds(7) / "landing" / 17`` is a node two levels below.
 
     ```python
-    from skillweave.types import Seeds
+    from skillweave._internal.seeding import Seeds
 
     noise = (Seeds(7) / "landing" / 17).numpy().normal(size=3)  # always the same three
     ```

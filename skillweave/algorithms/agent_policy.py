@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave._internal.policy_protocol import Memory, Memoryless
 from skillweave.algorithms.base import OBS_STATS, Algorithm
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.parameters import ParameterGroup
@@ -20,8 +21,8 @@ from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.networks.net import seen_places
 from skillweave.ops.seen import Seen
+from skillweave.policies.core import Array
 from skillweave.spaces import pack, space_from_json, space_to_json, to_tensor
-from skillweave.types import Array, Memory, Memoryless
 
 S = TypeVar("S")
 

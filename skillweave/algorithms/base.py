@@ -23,6 +23,7 @@ from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import CLIP, merge_moments, scale_of
 from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.ops.threads import torch_threads
+from skillweave.policies.core import Array
 from skillweave.spaces import (
     ActionCodec,
     ChoiceSpace,
@@ -33,7 +34,6 @@ from skillweave.spaces import (
     numbered_choice_codec,
     obs_codec,
 )
-from skillweave.types import Array
 
 S = TypeVar("S")
 Device = torch.device | str

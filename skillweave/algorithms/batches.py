@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skillweave._internal.paths import name_of
-from skillweave.types import Array
+from skillweave.policies.core import Array
 
 if TYPE_CHECKING:
     from torch import Tensor

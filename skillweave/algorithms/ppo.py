@@ -32,8 +32,8 @@ from skillweave.ops.losses import approximate_kl, likelihood_ratio, ppo_policy_l
 from skillweave.ops.moments import explained_variance, masked_mean, normalize
 from skillweave.ops.optim import kl_adapted_rate
 from skillweave.ops.returns import gae
+from skillweave.policies.core import Array
 from skillweave.spaces import ChoiceSpace
-from skillweave.types import Array
 
 REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
 """Metrics of a minibatch."""

@@ -18,6 +18,7 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import as_path, short, shown_path
 from skillweave._internal.notices import notice
 from skillweave._internal.paths import AGENT, join, level_of, name_of
+from skillweave._internal.policy_protocol import Memory, Policy
 from skillweave._internal.shipped import weights_path
 from skillweave._internal.terminal import printable
 from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy
@@ -103,7 +104,6 @@ from skillweave.training.evaluation_file import (
 )
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.training.stage import Together
-from skillweave.types import Memory, Policy
 from skillweave.workers.cluster import Ray
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from skillweave._internal.notices import notice
+from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import AgentHeader
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
@@ -20,16 +21,15 @@ from skillweave.hierarchy.recorded import (
     with_entry,
 )
 from skillweave.hierarchy.roles import Level, Roles, roles_of
-from skillweave.reporting.report.facts import plain, settings
+from skillweave.reporting.report.facts import plain
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import Manifest, SkillEntry
+from skillweave.runs.manifest import Manifest, SkillEntry, settings_of
 from skillweave.runs.user_code import environment_texts, notice_changes
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import other_goals
 from skillweave.spaces import space_from_json
 from skillweave.training.plain_agent import Declared, load_agent_of
-from skillweave.types import Policy
 
 MOST_NAMED = 3
 """Settings that a message names."""
@@ -124,8 +124,8 @@ def differences(content: Manifest, run: RunDirectory, *, budgets: bool = True) -
         content: the manifest that a new run would have.
         budgets: compare the steps of stages, too.
     """
-    here = settings(content)
-    there = settings(run.manifest)
+    here = settings_of(content)
+    there = settings_of(run.manifest)
     if not budgets:
         here = {k: v for k, v in here.items() if not k.endswith(".budget")}
     evolve = tuple(f"{s.name}." for s in run.manifest.stages if s.evolution)
@@ -134,12 +134,15 @@ def differences(content: Manifest, run: RunDirectory, *, budgets: bool = True) -
     # Greediness that this declaration leaves open cannot differ.
     greedy = ("greedy_skills", "greedy_selector")
     unset = {k for k in both if k.endswith(greedy) and here[k] is None}
-    differ = [k for k in both if k not in unset and plain(here[k]) != plain(there[k])]
+    differ = [k for k in both if k not in unset and here[k] != there[k]]
     if not differ:
         return ""
-    named = [
-        f"{k} is {plain(there[k])} (declared now: {plain(here[k])})" for k in differ[:MOST_NAMED]
-    ]
+    named = []
+    for name in differ[:MOST_NAMED]:
+        then, now = plain(there[name]), plain(here[name])
+        if then == now:  # they differ in digits that people do not read
+            then, now = repr(there[name]), repr(here[name])
+        named.append(f"{name} is {then} (declared now: {now})")
     more = f", and {len(differ) - MOST_NAMED} more differ" if len(differ) > MOST_NAMED else ""
     return f"the run continues with its own settings: {', '.join(named)}{more}"
 

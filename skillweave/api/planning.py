@@ -12,6 +12,7 @@ import numpy as np
 
 from skillweave._internal.messages import short
 from skillweave._internal.paths import SELECTOR
+from skillweave._internal.policy_protocol import Policy
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import PPO
 from skillweave.api.task_views import OwnSelector, own_skills
@@ -31,7 +32,6 @@ from skillweave.runs.initial_policies import Learnt
 from skillweave.skills.skill_set import skills_below
 from skillweave.spaces import obs_codec
 from skillweave.training.imitation import imitate
-from skillweave.types import Policy
 
 D = TypeVar("D", bound=Declaration)
 

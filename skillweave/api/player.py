@@ -6,13 +6,14 @@ from typing import Any, Literal
 
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
+from skillweave._internal.policy_protocol import Policy
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.policy import SkillAlone
 from skillweave.policies.actor import ROW, Actor, Deployed
+from skillweave.policies.core import Array
 from skillweave.policies.spaces import space_of
 from skillweave.skills.skill_set import in_place
 from skillweave.spaces import obs_dtype
-from skillweave.types import Array, Policy
 
 
 @checked_names

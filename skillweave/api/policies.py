@@ -9,6 +9,7 @@ from typing import Any
 from skillweave import schema
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import as_path, short
+from skillweave._internal.policy_protocol import Policy
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.export.read import read_policy
@@ -16,7 +17,6 @@ from skillweave.export.write import Export, write_export
 from skillweave.policies.codec import MANIFEST
 from skillweave.runs import hub
 from skillweave.skills.foreign_policy import Foreign, fitted
-from skillweave.types import Policy
 
 
 @checked_names

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from skillweave._internal.messages import shown_path
+from skillweave._internal.policy_protocol import Policy
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
 from skillweave.planning import CallLog
@@ -22,7 +23,6 @@ from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.schema import Count, fitted
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.skill_set import SkillSet, skills_below
-from skillweave.types import Policy
 
 
 class RunCalls:

@@ -12,9 +12,10 @@ from typing import Any, Self
 
 import gymnasium as gym
 
+from skillweave._internal.policy_protocol import Memory, Policy
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.planning.task_env import OwnView
-from skillweave.policies.core import LastCall
+from skillweave.policies.core import Array, LastCall, Step
 from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.policies.leaves import Selector
@@ -27,7 +28,6 @@ from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.own_part import OwnPart
 from skillweave.skills.skill_set import SkillSet, policy_of
-from skillweave.types import Array, Memory, Policy, Step
 
 
 class OwnPolicy(Functional):

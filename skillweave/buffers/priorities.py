@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from skillweave.types import Array
+from skillweave.policies.core import Array
 
 FAN_OUT = 32  # children of a node: four levels reach a million leaves
 EPSILON = 1e-6  # the smallest priority: a transition without error is still drawn sometimes

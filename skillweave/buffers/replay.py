@@ -13,8 +13,8 @@ from torch import Tensor
 from skillweave.algorithms.batches import Batch, Sample
 from skillweave.buffers.priorities import Priorities
 from skillweave.buffers.replay_storage import NOTHING, TERMINATED, Columns, copy_into
+from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
-from skillweave.types import Array
 
 
 class ReplayStore:

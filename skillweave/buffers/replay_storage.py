@@ -13,8 +13,8 @@ from torch import Tensor
 from skillweave.algorithms.batches import Batch
 from skillweave.buffers.ram import check_memory
 from skillweave.errors import DeclarationError, RunError
+from skillweave.policies.core import Array
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
-from skillweave.types import Array
 
 # Content of a slot. The value of the successor counts after GOES_ON, not after TERMINATED.
 NOTHING = 0

@@ -12,8 +12,8 @@ from torch import Tensor
 from skillweave._internal.prefixes import unprefixed
 from skillweave.algorithms.batches import SCHEMA, Batch, Reference, Rollout, column
 from skillweave.errors import RunError
+from skillweave.policies.core import Array
 from skillweave.spaces import ActionCodec, obs_dtype, obs_shape, to_tensor
-from skillweave.types import Array
 
 ONE_ROW = ("recurrent_state", "log_std")
 """Fields that have one row, whatever the number of rows of the others."""

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Self
 
+from skillweave._internal.parent_process import when_parent_ends
 from skillweave.errors import SkillweaveError, TrainingError, reworded
 
 PATIENCE = 1.0
@@ -89,7 +90,8 @@ class Processes:
 
 def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
     """Do a job, and send its result or its error."""
-    _end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
+    when_parent_ends(lambda: os._exit(1))
     result: Any = None
     problem: Exception | None = None
     try:
@@ -104,15 +106,3 @@ def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) ->
         sender.send((result, problem))
     except Exception:  # a result that cannot be sent
         sender.send((None, RuntimeError(traceback.format_exc())))
-
-
-def _end_with_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()

@@ -83,7 +83,7 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
         _change(declaration, owner, owners[owner])
     if "steps" in names and declaration.steps:
         _set_total(declaration, declaration.steps, steps, list(filter(_PART.fullmatch, names)))
-    declaration.__post_init__()
+    declaration.validate()
 
 
 def _split(setting: str, wrong: str) -> tuple[str, str]:

@@ -11,8 +11,8 @@ import torch
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.networks.net import Net
+from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
-from skillweave.types import Array
 
 _ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "tanh": lambda x: np.tanh(x, out=x),

@@ -18,15 +18,16 @@ import numpy as np
 
 from skillweave._internal.messages import error_text, short
 from skillweave._internal.notices import notice
+from skillweave._internal.rewards import LARGEST_REWARD, wrong_reward
 from skillweave.envs.env_infos import MASK, observes_mask
 from skillweave.envs.image_bounds import ImageBounds
 from skillweave.envs.pool import first_row
 from skillweave.errors import EnvError, SkillweaveError
+from skillweave.policies.core import Array
 from skillweave.policies.floats import by_program
 from skillweave.policies.spaces import at, space_of
 from skillweave.spaces import choice_counts, obs_shape
 from skillweave.spaces.packing import leaf_spaces, parts
-from skillweave.types import LARGEST_REWARD, Array, wrong_reward
 
 LONGEST_EPISODE = 100_000
 """Steps after which an engine truncates an episode that has not ended before."""

@@ -29,11 +29,11 @@ from skillweave.envs.env_infos import ActionMasks, time_limits
 from skillweave.envs.history import History
 from skillweave.envs.repeats import check_first_steps, check_used
 from skillweave.errors import EnvError, SkillweaveError, reworded
+from skillweave.policies.core import Array, Step
 from skillweave.policies.infos import InfoKeys, batched_infos
 from skillweave.policies.spaces import space_of
 from skillweave.skills.outputs import keys_of
 from skillweave.spaces import leaves, obs_dtype, obs_shape, put_observation
-from skillweave.types import Array, Step
 
 OWN_GENERATOR = "self.np_random instead, which super().reset(seed=seed) seeds"
 LOOKS = 40

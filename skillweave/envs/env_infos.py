@@ -11,7 +11,7 @@ import numpy as np
 from skillweave._internal.messages import short
 from skillweave._internal.notices import notice
 from skillweave.errors import EnvError
-from skillweave.policies.core import OWN_REWARD, SUCCESS
+from skillweave.policies.core import OWN_REWARD, SUCCESS, Array
 from skillweave.policies.infos import Infos, batched_infos, one_number
 from skillweave.policies.spaces import allows_each
 from skillweave.skills.outputs import info_keys
@@ -22,7 +22,6 @@ from skillweave.spaces import (
     obs_shape,
     put_observation,
 )
-from skillweave.types import Array
 
 
 def joined_infos(infos: Sequence[Mapping[str, Any]], counts: Sequence[int]) -> dict[str, Any]:

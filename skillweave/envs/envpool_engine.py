@@ -11,8 +11,8 @@ import numpy as np
 from skillweave.envs.engine import RawStep, WatchedEngine
 from skillweave.envs.pool import MakePool, installed, no_precision_warnings
 from skillweave.errors import EnvError, MissingExtra
+from skillweave.policies.core import Array
 from skillweave.spaces import pack
-from skillweave.types import Array
 
 RENEW_AFTER = 100_000
 """Steps since the seed of a pool after which environments move to a new pool."""

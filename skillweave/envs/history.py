@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from skillweave.types import Array
+from skillweave.policies.core import Array
 
 
 class History:

@@ -10,10 +10,10 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.notices import notice
+from skillweave.policies.core import Array
 from skillweave.policies.spaces import at
 from skillweave.spaces.observations import image_layout
 from skillweave.spaces.packing import leaf_spaces
-from skillweave.types import Array
 
 LOOKS = 64
 """The first batches of observations, which are checked."""

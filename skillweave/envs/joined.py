@@ -8,8 +8,7 @@ import numpy as np
 
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.env_infos import joined_infos
-from skillweave.policies.core import info_rows
-from skillweave.types import Array
+from skillweave.policies.core import Array, info_rows
 
 
 class JoinedEngines:

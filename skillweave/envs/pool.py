@@ -17,8 +17,8 @@ import numpy as np
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, suggest
 from skillweave.errors import DeclarationError, EnvError, needs_extra
+from skillweave.policies.core import Array
 from skillweave.spaces import pack, unpack
-from skillweave.types import Array
 
 POOL_SEEDS = 2**30
 """Seeds of pools are taken modulo this: EnvPool takes seeds below twice as much."""

@@ -17,7 +17,7 @@ from skillweave._internal.notices import are_collected, notice
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.envs.env_infos import allowed_rows, random_actions
 from skillweave.errors import SkillweaveError
-from skillweave.types import Array
+from skillweave.policies.core import Array
 
 FIRST_STEPS = 5
 """Steps of an episode before training."""

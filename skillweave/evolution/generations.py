@@ -26,10 +26,10 @@ from skillweave.evolution.shard import FitnessEnvs, policy_of
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member
 from skillweave.networks.config import Network
+from skillweave.policies.core import Array
 from skillweave.runs.manifest import BestEntry, Generation, LineageLine, MemberEntry, Winner
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import StageRun
-from skillweave.types import Array
 from skillweave.workers.placement import LOCAL, Placement
 
 

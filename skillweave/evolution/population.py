@@ -17,9 +17,9 @@ from skillweave.evolution.selection import select
 from skillweave.evolution.shard import FitnessEnvs, OnGenerationTick, Shard
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member, copy, grouped
+from skillweave.policies.core import Array
 from skillweave.runs.manifest import Origin
 from skillweave.training.learning_task import LearningTask
-from skillweave.types import Array
 
 
 class Population:

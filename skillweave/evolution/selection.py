@@ -10,7 +10,7 @@ import numpy as np
 from skillweave._internal.arguments import checked_names
 from skillweave.errors import TrainingError
 from skillweave.evolution.config import Evolution, Tournament, Truncation
-from skillweave.types import Array
+from skillweave.policies.core import Array
 
 
 @checked_names

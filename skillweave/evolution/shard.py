@@ -24,6 +24,7 @@ from skillweave.experience.collector import RETURN, Collector, joined_from, part
 from skillweave.experience.group import Collectors
 from skillweave.experience.learners import Calling
 from skillweave.ops.device import resolve_device
+from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, EpisodeTally, Tick
 from skillweave.training.learner import RolloutLearner, Stack
@@ -31,7 +32,6 @@ from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Loop, LoopState
 from skillweave.training.periodic import episodes_of
 from skillweave.training.replay_learner import ReplayLearner, store_of
-from skillweave.types import Array
 
 OnGenerationTick = Callable[[int, dict[str, float]], None]
 """Receives the steps of all members in this generation so far, and the metrics of an update."""

@@ -22,9 +22,9 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json, conf
 from skillweave.evolution.shard import FitnessEnvs, OnGenerationTick, Shard
 from skillweave.evolution.stacks import Member
 from skillweave.experience.group import joined_states, split_states
+from skillweave.policies.core import Array
 from skillweave.training.episodes import EpisodeTally
 from skillweave.training.learning_task import LearningTask
-from skillweave.types import Array
 from skillweave.workers.placement import MakeWorkers
 
 Sent = tuple[int, dict[str, Any], int, dict[str, Array]]

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams, Algorithm
+from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
-from skillweave.types import Array
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ from skillweave.experience.writer import TraceWriter
 from skillweave.policies.core import (
     LIMIT,
     OWN,
+    Array,
+    Step,
     Turn,
     World,
     end_with_episode,
@@ -34,7 +36,6 @@ from skillweave.policies.core import (
 from skillweave.policies.spaces import Space, space_of
 from skillweave.skills.goals import goals_of
 from skillweave.skills.outputs import info_keys
-from skillweave.types import Array, Step
 
 RETURN, TASK_RETURN, LENGTH, SUCCESS = range(4)
 """The first columns of ``Collected.episodes``."""

@@ -10,9 +10,9 @@ import numpy as np
 from skillweave._internal.paths import SELECTOR
 from skillweave.algorithms.batches import Batch, Trace, padded_last_axis
 from skillweave.experience.levels import LearningLevel
+from skillweave.policies.core import Array
 from skillweave.policies.hierarchy import unless_none
 from skillweave.policies.parts import OBSERVATION
-from skillweave.types import Array
 
 SMOOTHED = 0.05
 """Share of a guide's choice that is uniform: without it one deviation would cost infinitely much.

@@ -1,4 +1,4 @@
-"""Several collectors that fill one batch, in this thread."""
+"""Several collectors that fill one batch, in this thread or elsewhere."""
 
 from __future__ import annotations
 
@@ -11,31 +11,88 @@ from skillweave._internal.seeding import Seeds
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.acting import Request
 from skillweave.experience.collector import Collected, Collector, joined_collected
-from skillweave.types import Array
+from skillweave.policies.core import Array
 
 MakeCollector = Callable[[int, int], Collector]
 """Given how many environments and the number of the first one, makes a collector."""
 
 
-class Collectors:
+class CollectorGroup:
     """W collectors of as many environments each, whose experience stands side by side.
 
     Each has a part of the environments of every member. What they find depends on how many they
     are, and not on where they run.
 
     Args:
-        parts: the collectors, in this thread.
+        num_envs: of all collectors.
         members: P.
     """
 
-    def __init__(self, parts: Sequence[Collector], members: int = 1) -> None:
-        self.parts = list(parts)
+    def __init__(self, num_envs: int, members: int) -> None:
+        self.num_envs = num_envs
         self.members = members
-        self.num_envs = sum(part.num_envs for part in parts)
         self.steps_made = 0
         """Environment steps that were made together."""
         self.begun_anew = 0
         """Environments that were lost with their worker, and did not repeat themselves."""
+
+    def start(self, seeds: Seeds) -> None:
+        """Start every environment, unless they have started."""
+        raise NotImplementedError
+
+    def collect(self, request: Request) -> Collected:
+        """``request.rows`` steps of each environment."""
+        raise NotImplementedError
+
+    def state(self) -> dict[str, Array]:
+        """Return what ``restore`` needs. It changes nothing."""
+        raise NotImplementedError
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Restore the open episodes of ``state``; return (k,) environments that start again."""
+        raise NotImplementedError
+
+    def differing(self) -> Array:
+        """(k,) environments that are not where they were, since they were lost with a worker.
+
+        Learners have seen them elsewhere, so what was open there must not go on. Each is
+        returned once.
+        """
+        return np.empty(0, np.int64)
+
+    def finish(self) -> None:
+        """Check at the end of training what it has left in the environments."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Release the environments."""
+        raise NotImplementedError
+
+    def _joined(self, found: Sequence[Collected]) -> Collected:
+        collected = joined_collected(found, self.members)
+        self.steps_made += collected.steps
+        return collected
+
+    def _columns(self, ids: Sequence[Array]) -> Array:
+        """Environments of each collector as columns of the experience."""
+        count = len(ids)
+        each = self.num_envs // self.members  # of a member
+        own = each // count  # of a member, in one collector
+        found = [part // own * each + number * own + part % own for number, part in enumerate(ids)]
+        return np.sort(np.concatenate(found))
+
+
+class Collectors(CollectorGroup):
+    """Collectors in this thread.
+
+    Args:
+        parts: the collectors.
+        members: P.
+    """
+
+    def __init__(self, parts: Sequence[Collector], members: int = 1) -> None:
+        super().__init__(sum(part.num_envs for part in parts), members)
+        self.parts = list(parts)
 
     def start(self, seeds: Seeds) -> None:
         """Start every environment, unless they have started."""
@@ -56,14 +113,6 @@ class Collectors:
         states = split_states(state, len(self.parts))
         return self._columns([p.restore(s) for p, s in zip(self.parts, states, strict=True)])
 
-    def differing(self) -> Array:
-        """Return the environments (k,) that are in another state since a worker was lost.
-
-        Learners have seen them elsewhere, so what was open there must not go on. Each is
-        returned once.
-        """
-        return np.empty(0, np.int64)
-
     def finish(self) -> None:
         """Check at the end of training that it has left nothing in the environments."""
         for part in self.parts:
@@ -73,19 +122,6 @@ class Collectors:
         """Release the environments."""
         for part in self.parts:
             part.close()
-
-    def _joined(self, found: Sequence[Collected]) -> Collected:
-        collected = joined_collected(found, self.members)
-        self.steps_made += collected.steps
-        return collected
-
-    def _columns(self, ids: Sequence[Array]) -> Array:
-        """Return environments of each collector as columns of the joined rows."""
-        count = len(ids)
-        each = self.num_envs // self.members  # of a member
-        own = each // count  # of a member, in one collector
-        found = [part // own * each + number * own + part % own for number, part in enumerate(ids)]
-        return np.sort(np.concatenate(found))
 
 
 def joined_states(states: Sequence[dict[str, Array]]) -> dict[str, Array]:

@@ -22,7 +22,7 @@ from skillweave.experience.levels import LearningLevel, own_memory, with_learner
 from skillweave.experience.search import Starts
 from skillweave.experience.views import OwnSteps, call_successes, info_numbers_of, rows_of
 from skillweave.experience.writer import TraceWriter
-from skillweave.policies.core import EPISODE, LIMIT, RUNNING, RowPolicy, end_with_episode
+from skillweave.policies.core import EPISODE, LIMIT, RUNNING, Array, RowPolicy, end_with_episode
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.policies.leaves import Learning
 from skillweave.skills import Reflex, Skill
@@ -30,7 +30,6 @@ from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.own_part import OwnPart
 from skillweave.skills.skill_set import SkillSet, acting_apart, acting_policy, within
 from skillweave.spaces import action_codec
-from skillweave.types import Array
 
 CALLS = (*OF_STEP, "elapsed", "skill", "call_elapsed", "call_end", "call_length")
 """The columns of a trace from which calls are logged."""

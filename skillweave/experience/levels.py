@@ -11,15 +11,15 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.paths import CRITIC, SELECTOR
+from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.batches import Trace
 from skillweave.experience.acting import Acting
-from skillweave.policies.core import Memory
+from skillweave.policies.core import Array, Memory
 from skillweave.policies.hierarchy import ActiveGuide, CallAndReturn, Interruption
 from skillweave.policies.leaves import Learning
 from skillweave.skills import Skill
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.skill_set import SkillSet, within
-from skillweave.types import Array, Policy
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,20 @@ import numpy as np
 from skillweave.envs.engine import Engine
 from skillweave.envs.env_infos import allowed_rows, random_actions
 from skillweave.errors import TrainingError
-from skillweave.policies.core import RUNNING, Turn, World, flat, observed, part_of, restart
+from skillweave.policies.core import (
+    RUNNING,
+    Array,
+    Step,
+    Turn,
+    World,
+    flat,
+    observed,
+    part_of,
+    restart,
+)
 from skillweave.skills import Skill, call_method
 from skillweave.skills.skill_set import SkillSet, acting_policy, within
 from skillweave.spaces import obs_dtype, obs_shape
-from skillweave.types import Array, Step
 
 PATIENCE = 5_000
 """Steps of an environment in search of a state where the skill may start, if none is ever found."""

@@ -15,14 +15,13 @@ import numpy as np
 from skillweave._internal.messages import short
 from skillweave.algorithms.batches import OF_STEP, Batch, Trace
 from skillweave.errors import EnvError, SkillweaveError
-from skillweave.policies.core import OWN, RUNNING, own_step, part_of
+from skillweave.policies.core import OWN, RUNNING, Array, Step, own_step, part_of
 from skillweave.policies.infos import Infos
 from skillweave.skills import Skill, call_method
 from skillweave.skills.goals import Goals, check_reads_goal
 from skillweave.skills.outputs import missing_key
 from skillweave.skills.own_part import OwnPart
 from skillweave.skills.probing import first_time
-from skillweave.types import Array, Step
 
 AT_ONCE = 1 << 26
 """Bytes of observations that a skill judges at once."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from skillweave.algorithms.batches import Trace, column
 from skillweave.errors import EnvError
+from skillweave.policies.core import Array
 from skillweave.policies.infos import with_missing
-from skillweave.types import Array
 
 
 class TraceWriter:

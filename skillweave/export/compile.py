@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.errors import PolicyError
 from skillweave.export.foreign import as_file
@@ -30,7 +31,6 @@ from skillweave.policies.planned import Planned
 from skillweave.policies.spaces import Space, space_of
 from skillweave.skills.goals import Goals
 from skillweave.skills.skill_set import in_place
-from skillweave.types import Policy
 
 
 def deployed(policy: Policy) -> Deployed:

@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.messages import short
+from skillweave._internal.policy_protocol import Policy
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.policies.actor import Deployed
@@ -33,7 +34,6 @@ from skillweave.skills.mapped import check_range
 from skillweave.skills.mapping import GoalValue, check_in_range
 from skillweave.skills.skill_set import SkillSet, within
 from skillweave.spaces.saving import gym_space
-from skillweave.types import Policy
 
 
 def read_policy(

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import policies
+from skillweave._internal.policy_protocol import Policy
 from skillweave._internal.terminal import printable
 from skillweave.export.compile import deployed
 from skillweave.policies.codec import FORMAT, MANIFEST, Written
 from skillweave.policies.untrusted import checksum
 from skillweave.runs.files import write_bytes
-from skillweave.types import Policy
 
 PACKAGE = "skillweave_policies"
 """The name of ``skillweave.policies`` in an export, whose modules import one another by place."""

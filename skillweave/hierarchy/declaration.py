@@ -19,7 +19,7 @@ from skillweave.hierarchy.checks import (
 )
 from skillweave.hierarchy.fitting import check_settings, ready_policies, ready_selectors
 from skillweave.hierarchy.roles import Level, Nestable, Roles, hierarchies_of, roles_of
-from skillweave.hierarchy.schedule import DEFAULT_STEPS, budgets_of, stages_of
+from skillweave.hierarchy.schedule import DEFAULT_STEPS, budgets_of, splits_total, stages_of
 from skillweave.hierarchy.settings import (
     Apart,
     CallSteps,
@@ -97,9 +97,7 @@ class Declaration(Nestable, Declared):
 
     def _splits_steps(self) -> bool:
         """Return True if ``steps`` changes the budget of a stage, or no stage is trained."""
-        other = copy.copy(self)
-        other.steps = 2 * (self.steps or DEFAULT_STEPS)
-        return other.total_steps != self.total_steps or not self.total_steps
+        return splits_total(roles_of(self))
 
     def _level(self, path: str, as_skill: Skill | None) -> Level:
         """Return the settings of this hierarchy, without those of hierarchies below."""

@@ -8,6 +8,7 @@ from typing import Any, cast
 import gymnasium as gym
 
 from skillweave._internal.paths import join
+from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
 from skillweave.errors import DeclarationError, PolicyError
@@ -26,7 +27,6 @@ from skillweave.skills.skill_set import skills_below
 from skillweave.spaces import obs_codec
 from skillweave.training.env_check import check_rollout
 from skillweave.training.role import Role
-from skillweave.types import Policy
 
 
 def check_settings(roles: Roles) -> None:

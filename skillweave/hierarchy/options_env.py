@@ -15,7 +15,7 @@ from skillweave.envs.checked import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
 from skillweave.envs.env_infos import allowed_rows
 from skillweave.errors import DeclarationError
-from skillweave.policies.core import RUNNING, Turn, World, restart
+from skillweave.policies.core import RUNNING, Array, Turn, World, restart
 from skillweave.policies.floats import usual_floats
 from skillweave.policies.hierarchy import SKILL, unless_none
 from skillweave.policies.parts import GOAL
@@ -23,7 +23,6 @@ from skillweave.policies.spaces import space_of
 from skillweave.skills.skill_set import SkillSet, acting_policy, within
 from skillweave.spaces import obs_dtype, unpack
 from skillweave.spaces.choices import ChoiceSpace
-from skillweave.types import Array
 
 
 class OptionsEnv(VectorEnv[Any, Any, Any]):

@@ -10,8 +10,9 @@ from typing import Any, cast
 
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
+from skillweave._internal.policy_protocol import Policy
 from skillweave.errors import DeclarationError
-from skillweave.policies.core import Memory as InPlaceMemory, flat, split
+from skillweave.policies.core import Array, Memory as InPlaceMemory, flat, split
 from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import ActiveGuide, Interruption
 from skillweave.policies.parts import OWN_GOAL
@@ -20,7 +21,6 @@ from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import without_goal
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.skill_set import SkillSet, acting_alone, acting_policy
-from skillweave.types import Array, Policy
 
 
 @checked_names

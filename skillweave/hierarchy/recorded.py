@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from skillweave._internal.policy_protocol import Policy
 from skillweave.errors import RunError
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.policies.untrusted import shown
@@ -15,7 +16,6 @@ from skillweave.skills.lengths import Lengths
 from skillweave.skills.own_part import part_to_json
 from skillweave.skills.residual import Residual
 from skillweave.spaces import space_to_json
-from skillweave.types import Policy
 
 
 def skill_entries(roles: Roles, ready: Mapping[str, Policy]) -> list[SkillEntry]:

@@ -20,7 +20,7 @@ from skillweave.planning import CallLog, Handover, join
 from skillweave.planning.handover import before_each, calls_done, shown_rate
 from skillweave.planning.predicates import Held, as_event
 from skillweave.planning.record import RandomChoice, with_returns
-from skillweave.policies.core import Memory, Turn
+from skillweave.policies.core import Array, Memory, Step, Turn
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Matrix, RepairEntry, StageEntry
@@ -31,7 +31,6 @@ from skillweave.skills.skill_set import SkillSet
 from skillweave.training.learning_task import LearningTask, skill_task
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.trainer import Course
-from skillweave.types import Array, Step
 
 START_CALLS = 1
 """The most calls at random before the other episodes of a repair, if the hierarchy has any."""

@@ -25,6 +25,7 @@ from skillweave._internal.paths import (
     levels_to,
     name_of,
 )
+from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
@@ -37,7 +38,6 @@ from skillweave.skills.own_part import OwnPart, declared_sees
 from skillweave.skills.residual import Residual
 from skillweave.skills.skill_set import LimitedCalls, SkillSet
 from skillweave.training.role import Role
-from skillweave.types import Policy
 
 H = TypeVar("H", bound="Nestable")
 CALL = 16

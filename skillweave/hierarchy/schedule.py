@@ -82,6 +82,32 @@ def _level_budgets(roles: Roles, level: Level, total: int) -> dict[str, int]:
     return budgets
 
 
+def splits_total(roles: Roles) -> bool:
+    """Return True if a stage takes its steps from the hierarchy's total, or none is trained.
+
+    Else every stage has steps of its own, and the total means nothing.
+    """
+    return _takes_total(roles, roles.outermost) or not budgets_of(roles)
+
+
+def _takes_total(roles: Roles, level: Level) -> bool:
+    """Return True if a stage of a level, or of levels below it, takes steps from its total."""
+    if roles.learns_together(level) and level.together.steps is None:
+        return True
+    if not roles.learns_apart(level):
+        return False
+    if roles[level.selector_path].config is not None and level.apart.selector_steps is None:
+        return True
+    for path, skill in level.skills.items():
+        if path in roles.levels:
+            inner = roles.levels[path]
+            if inner.steps is None and _takes_total(roles, inner):
+                return True
+        elif roles[path].config is not None and (skill.steps or level.apart.skill_steps) is None:
+            return True
+    return False
+
+
 def stages_of(roles: Roles) -> list[Stage]:
     """Return all stages in their order: hierarchies below, skills, selector, all together."""
     budgets = budgets_of(roles)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from skillweave._internal.paths import SELECTOR, level_of
+from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy.assembly import assembled, can_act
@@ -33,7 +34,6 @@ from skillweave.training.plain_agent import Declared, PlainAgent
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_run import MakeLearner
 from skillweave.training.trainer import Course
-from skillweave.types import Policy
 
 
 def manifest(

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from skillweave._internal.messages import short
 from skillweave._internal.paths import AGENT, below, join, level_of
+from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
@@ -36,7 +37,6 @@ from skillweave.runs.user_code import environment_texts, notice_changes
 from skillweave.skills.foreign_policy import Foreign, as_recorded
 from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
 from skillweave.spaces import same_space
-from skillweave.types import Policy
 
 
 @dataclass(kw_only=True)

@@ -22,9 +22,9 @@ from skillweave.ops.distributions import (
     tanh_log_det,
     with_epsilon,
 )
+from skillweave.policies.core import Array
 from skillweave.spaces import ActionCodec, ChoiceCodec, JointCodec
 from skillweave.spaces.choices import chosen
-from skillweave.types import Array
 
 LOG_STD = (-5.0, 2.0)
 """Range of a log deviation that depends on the state."""

@@ -12,6 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from skillweave._internal.messages import as_path
+from skillweave._internal.rewards import LARGEST_REWARD
 from skillweave.algorithms.batches import INFO
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.planning.columns import (
@@ -21,7 +22,7 @@ from skillweave.planning.columns import (
     columns_of,
     fields_of,
 )
-from skillweave.policies.core import CallEnd
+from skillweave.policies.core import Array, CallEnd
 from skillweave.runs.files import read_tensors, record_in, write_tensors
 from skillweave.runs.user_code import Texts
 from skillweave.schema import AtLeastOne, Count
@@ -35,7 +36,6 @@ from skillweave.spaces import (
     space_to_json,
     to_tensor,
 )
-from skillweave.types import LARGEST_REWARD, Array
 
 PER_SKILL = ("checksums", "sees", "recurrent", "own_success")
 """Fields with a value for each skill."""

@@ -16,10 +16,9 @@ import numpy as np
 from skillweave._internal.messages import shortened, suggest
 from skillweave.algorithms.batches import INFO
 from skillweave.errors import DeclarationError
-from skillweave.policies.core import CallEnd, Choices
+from skillweave.policies.core import Array, CallEnd, Choices, Step
 from skillweave.runs.user_code import Texts
 from skillweave.spaces import obs_codec, obs_dtype, obs_shape, to_tensor
-from skillweave.types import Array, Step
 
 ENDS = {end: end.name.lower() for end in list(CallEnd)[1:]}
 """Names of the ends of calls."""

@@ -14,8 +14,8 @@ from skillweave.planning.columns import CallColumns
 from skillweave.planning.lacking import read_log
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbors import FeatureMap, Standard, evenly, nearest
+from skillweave.policies.core import Array
 from skillweave.spaces import leaves, obs_codec
-from skillweave.types import Array
 
 MOST_STEPS = 0.5
 """The share of steps in which a number has to change to be compared, if a skill does not see it."""

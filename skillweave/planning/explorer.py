@@ -11,9 +11,8 @@ from skillweave.planning.calls import CallLog
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbors import check_features
-from skillweave.policies.core import Memory, RowPolicy, Turn
+from skillweave.policies.core import Array, Memory, RowPolicy, Turn
 from skillweave.schema import AtLeastOne, Check, Fraction, Positive, fitted
-from skillweave.types import Array
 
 PER_FEATURE = 0.25
 """Standard deviations of each feature from which on a call is new."""

@@ -23,11 +23,10 @@ from skillweave.planning.lacking import names_of, read_log
 from skillweave.planning.machine import RewardMachine, predicates_of
 from skillweave.planning.neighbors import evenly, nearest
 from skillweave.planning.planner import Planner
-from skillweave.policies.core import CallEnd, LastCall, Turn, World
+from skillweave.policies.core import Array, CallEnd, LastCall, Turn, World
 from skillweave.policies.plan import SOFT, Readings
 from skillweave.policies.planned import SLACK, Planned
 from skillweave.spaces import leaves
-from skillweave.types import Array
 
 EPISODES = 200
 GOALS = 16

@@ -13,9 +13,9 @@ from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.predicates import Predicate
+from skillweave.policies.core import Array, Step, read_only
 from skillweave.policies.selectors import function_name
 from skillweave.skills.outputs import call_user, checked
-from skillweave.types import Array, Step, read_only
 
 
 @checked_names

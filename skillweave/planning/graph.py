@@ -25,7 +25,7 @@ from skillweave.planning.goal import GoalTask
 from skillweave.planning.lacking import check_possible, read_log
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbors import Standard, evenly, tie_order
-from skillweave.policies.core import CallEnd
+from skillweave.policies.core import Array, CallEnd
 from skillweave.policies.plan import (
     MOST_COUNTERS,
     Levels,
@@ -35,7 +35,6 @@ from skillweave.policies.plan import (
     Readings,
 )
 from skillweave.skills.skill_set import SkillSet
-from skillweave.types import Array
 
 LEVELS = 128
 """The most levels of a counter."""

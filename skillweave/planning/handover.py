@@ -20,10 +20,9 @@ from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
 from skillweave.planning.neighbors import Standard, nearest
 from skillweave.planning.predicates import Event, Held, as_event
-from skillweave.policies.core import CallEnd
+from skillweave.policies.core import Array, CallEnd
 from skillweave.policies.plan import weights_of
 from skillweave.schema import fitted
-from skillweave.types import Array
 
 START = "start"
 """The row of calls that begin an episode."""

@@ -11,9 +11,8 @@ from skillweave.planning.columns import CallColumns
 from skillweave.planning.machine import Arrow, RewardMachine, predicates_of
 from skillweave.planning.neighbors import Standard
 from skillweave.planning.predicates import Predicate
-from skillweave.policies.core import observed
+from skillweave.policies.core import Array, observed
 from skillweave.policies.plan import Readings
-from skillweave.types import Array
 
 TRIES = 20_000
 """Observations that are made up, to find one in which a predicate holds."""

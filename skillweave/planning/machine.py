@@ -15,15 +15,16 @@ from gymnasium.spaces import Box
 
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, suggest
+from skillweave._internal.rewards import LARGEST_REWARD
 from skillweave.errors import DeclarationError
 from skillweave.planning.predicates import Event, Held, Predicate, as_event, predicate_of
+from skillweave.policies.core import Array, Step
 from skillweave.policies.plan import Machine
 from skillweave.policies.selectors import function_name
 from skillweave.schema import fitted
 from skillweave.skills.automaton import Automaton, StateName, check_transitions
 from skillweave.skills.outputs import Wrapped
 from skillweave.skills.selector import checked_function, listed
-from skillweave.types import LARGEST_REWARD, Array, Step
 
 MOST_STATES = 10_000
 """The most states of a machine."""

@@ -16,9 +16,9 @@ from skillweave.errors import DeclarationError
 from skillweave.ops.moments import is_constant, scale_of
 from skillweave.ops.seen import Seen
 from skillweave.policies import plan
+from skillweave.policies.core import Array
 from skillweave.skills.outputs import Wrapped
 from skillweave.spaces import obs_codec, to_tensor
-from skillweave.types import Array
 
 MOST_DISTINCT = 0.9
 """The share of a number's distinct values that are looked for in the shortest interval."""

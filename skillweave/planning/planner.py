@@ -23,6 +23,7 @@ from skillweave.planning.lacking import asks_nothing, obstacle
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission import as_task
 from skillweave.planning.neighbors import check_features
+from skillweave.policies.core import Array
 from skillweave.policies.plan import Near
 from skillweave.policies.planned import Planned
 from skillweave.policies.spaces import space_of
@@ -31,7 +32,6 @@ from skillweave.schema import AtLeastOne, Check, Fraction, fitted
 from skillweave.skills.goal_spaces import MOST_SHOWN, shown_goal
 from skillweave.skills.selector import ReadySelector
 from skillweave.skills.skill_set import SkillSet, skills_below
-from skillweave.types import Array
 
 ALIKE = 0.1
 """The share of all goals' range below which goals are shown as one."""

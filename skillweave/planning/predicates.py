@@ -14,11 +14,11 @@ import numpy as np
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError, SkillError
+from skillweave.policies.core import Array, Step
 from skillweave.policies.selectors import function_name
 from skillweave.schema import AtLeastOne, fitted
 from skillweave.skills import Skill
 from skillweave.skills.outputs import call_checked
-from skillweave.types import Array, Step
 
 Reads = Literal["obs", "step"]
 WORD = r"[^\W\d][\w-]*"

@@ -23,6 +23,7 @@ from skillweave.planning.explorer import Explorer
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
 from skillweave.policies.core import (
     Around,
+    Array,
     CallEnd,
     Memory as InPlaceMemory,
     RowPolicy,
@@ -36,7 +37,6 @@ from skillweave.skills import ReadySelector, ready_selector
 from skillweave.skills.goal_spaces import blank_choices
 from skillweave.skills.skill_set import SkillSet, acting_policy, in_place, skills_below
 from skillweave.spaces import same_space
-from skillweave.types import Array
 
 
 class RandomChoice(RowPolicy):

@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.paths import join
+from skillweave._internal.policy_protocol import Memory
 from skillweave.algorithms.batches import INFO, OF_STEP, Batch, Trace
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
@@ -22,13 +23,12 @@ from skillweave.experience.views import OwnSteps, call_successes, info_numbers_o
 from skillweave.experience.writer import TraceWriter
 from skillweave.planning.calls import CallLog, seen_places, skill_checksums, skill_code
 from skillweave.planning.columns import GOAL, call_fields, fields_of
-from skillweave.policies.core import LIMIT, RUNNING
+from skillweave.policies.core import LIMIT, RUNNING, Array, Step
 from skillweave.runs.user_code import Texts, environment_texts
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.skill_set import SkillSet, skills_below
 from skillweave.spaces import obs_dtype, obs_shape
-from skillweave.types import Array, Memory, Step
 
 SUMS = (
     ("number", np.int64),

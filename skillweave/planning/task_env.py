@@ -12,11 +12,10 @@ from skillweave.envs.checked import last_observation
 from skillweave.errors import EnvError
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.mission import Task
-from skillweave.policies.core import OWN_REWARD, OWN_SUCCESS, SUCCESS
+from skillweave.policies.core import OWN_REWARD, OWN_SUCCESS, SUCCESS, Array, Step
 from skillweave.policies.infos import batched_infos
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.spaces.packing import parts, put_observation
-from skillweave.types import Array, Step
 
 OBSERVATION, TASK = "observation", "task"
 """Parts of observations that hold the task's state: what the environment gives, and that state."""

@@ -293,7 +293,10 @@ class RowPolicy:
 
 @dataclass(eq=False)
 class Around(RowPolicy):
-    """A policy that changes what another one sees or does; the base of combinators."""
+    """A policy that changes what another one sees or does; the base of combinators.
+
+    It forwards every method of a ``RowPolicy``.
+    """
 
     policy: RowPolicy
 
@@ -304,24 +307,40 @@ class Around(RowPolicy):
         self.fresh_calls = policy.fresh_calls
         self.holds = policy.holds
 
+    def start(self, n: int) -> Memory:
+        """Return the policy's fresh memory."""
+        return self.policy.start(n)
+
+    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return the policy's actions."""
+        return self.policy.act(memory, rows, obs, turn)
+
+    def observe(self, memory: Memory, rows: Array, step: Step) -> None:
+        """Let the policy notice a step."""
+        self.policy.observe(memory, rows, step)
+
+    def startable(self, obs: Array) -> Array:
+        """Return where the policy may start."""
+        return self.policy.startable(obs)
+
+    def stuck(self, memory: Memory, rows: Array, obs: Array) -> Array | bool:
+        """Return where the policy cannot go on."""
+        return self.policy.stuck(memory, rows, obs)
+
+    def redraws(self, greedy: bool) -> bool:
+        """Return whether the policy may choose otherwise where it is asked the same again."""
+        return self.policy.redraws(greedy)
+
+    def check(self, sees: Any, acts: Any, goal: Any, where: str) -> None:
+        """Check the policy."""
+        self.policy.check(sees, acts, goal, where)
+
 
 def innermost(policy: RowPolicy) -> RowPolicy:
     """Return the policy inside of all combinators."""
     while isinstance(policy, Around):
         policy = policy.policy
     return policy
-
-
-def _forward(name: str) -> Callable[..., Any]:
-    def call(self: Around, *arguments: Any) -> Any:
-        return getattr(self.policy, name)(*arguments)
-
-    return call
-
-
-for _name, _method in vars(RowPolicy).items():  # a combinator can forget none of them
-    if callable(_method):
-        setattr(Around, _name, _forward(_name))
 
 
 def code(what: str, label: str = "", *, needed: bool = True) -> Any:

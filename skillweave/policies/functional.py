@@ -88,8 +88,11 @@ class Functional:
     def is_plain(self) -> bool:
         """True if no subclass changes ``start``, ``act`` or ``observe``: ``in_place`` may act."""
         kind = type(self)
-        own = (kind.start, kind.act, kind.observe)
-        return own == (Functional.start, Functional.act, Functional.observe)
+        return (
+            kind.start is Functional.start
+            and kind.act is Functional.act
+            and kind.observe is Functional.observe
+        )
 
 
 class Returns(RowPolicy):

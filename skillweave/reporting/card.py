@@ -12,9 +12,10 @@ from urllib.parse import quote
 
 from skillweave.planning.run_log import handover_of
 from skillweave.reporting.report.curves import reached_steps, read_curves
-from skillweave.reporting.report.facts import WHY, WORDS, facts, plain, settings, stage_rows
+from skillweave.reporting.report.facts import WHY, WORDS, facts, plain, stage_rows
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import public
+from skillweave.runs.manifest import settings_of
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 from skillweave.training.skill_report import cells_of, skill_rows
 
@@ -42,7 +43,7 @@ def write_card(
         *_handed_over(run),
         _training(run),
         *(_shown(path) for path in figures),
-        _folded("All settings", ("setting", "value"), settings(run.manifest)),
+        _folded("All settings", ("setting", "value"), settings_of(run.manifest)),
         _folded("Versions", ("of", "version"), run.manifest.versions),
     ]
     return "\n\n".join(parts) + "\n"

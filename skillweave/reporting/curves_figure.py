@@ -13,6 +13,7 @@ import numpy as np
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import as_path, short, suggest
 from skillweave.errors import DeclarationError, RunError, needs_extra
+from skillweave.policies.core import Array
 from skillweave.reporting.report.curves import read_curves
 from skillweave.reporting.report.facts import is_binary
 from skillweave.reporting.report.groups import grouped, on_one_grid
@@ -22,7 +23,6 @@ from skillweave.runs.hub import must_be_own
 from skillweave.runs.several import open_runs
 from skillweave.schema import Check, fitted
 from skillweave.training.evaluation_file import load_evaluation
-from skillweave.types import Array
 
 Band = Literal["iqr", "range", "none"]
 _Inches = Annotated[float, Check("from 1 to 40 inches", lambda x: 1 <= x <= 40)]

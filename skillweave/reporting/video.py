@@ -14,19 +14,20 @@ import numpy as np
 
 from skillweave._internal.messages import error_text
 from skillweave._internal.notebooks import Markup, joined, paragraph
+from skillweave._internal.policy_protocol import Memory, Policy
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave._internal.terminal import printable
 from skillweave.envs.checked import LONG_EPISODE
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
+from skillweave.policies.core import Array
 from skillweave.reporting.palette import BAND, BLACK, LINE, RGB, WHITE, is_light
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.training.play import PlayedStep, SeededEpisodes, play
-from skillweave.types import Array, Memory, Policy
 
 MAX_WIDTH = 960  # pixels; larger frames are reduced
 MIN_WIDTH = 240  # pixels; smaller frames are enlarged

@@ -14,9 +14,9 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.errors import DeclarationError, EnvError, RunError, needs_extra
+from skillweave.policies.core import Array
 from skillweave.reporting.palette import OWN_COLORS
 from skillweave.runs.files import written
-from skillweave.types import Array
 
 
 class VideoWriter:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from skillweave._internal.paths import SELECTOR, decides, level_of, name_of
+from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy
 from skillweave.algorithms.base import Algorithm
 from skillweave.errors import DeclarationError, RunError
@@ -26,7 +27,6 @@ from skillweave.runs.files import (
 )
 from skillweave.runs.manifest import Manifest, SkillEntry, StageEntry, Start
 from skillweave.skills.foreign_policy import Foreign, as_recorded
-from skillweave.types import Policy
 
 
 @dataclass(frozen=True)

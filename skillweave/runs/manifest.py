@@ -1,6 +1,7 @@
 """The schemas of a run's files: ``run.json``, lines of metrics and of lineages, checkpoints.
 
-To add a field, add a line; with a default, if not every run has it.
+To add a field, add a line; with a default, if not every run has it. Fields of ``run.json`` are
+settings, which reports list and a resumed run compares, or they are marked as ``NoSetting``.
 """
 
 from __future__ import annotations
@@ -9,19 +10,39 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NotRequired,
+    Self,
+    TypeAlias,
+    TypedDict,
+    TypeVar,
+    get_args,
+)
 
 from skillweave._internal.paths import level_of, names_in
 from skillweave.algorithms.agent_policy import AgentHeader
 from skillweave.algorithms.config import config_from_json
 from skillweave.errors import EnvError, RunError
+from skillweave.policies.core import flat
 from skillweave.policies.untrusted import shown
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.files import read_json, record_in
-from skillweave.schema import AtLeastOne, Check, Count, NonNegative, Positive, Threads, as_json
+from skillweave.schema import (
+    AtLeastOne,
+    Check,
+    Count,
+    NonNegative,
+    Positive,
+    Threads,
+    annotations_of,
+    as_json,
+)
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
 
@@ -37,6 +58,15 @@ NodePath = Annotated[
     str, Check("names of letters, digits, '_' and '-', with '/' between", _is_path)
 ]
 """A name behind the names of the hierarchies around it: ``inner/skill``."""
+
+T = TypeVar("T")
+NO_SETTING = "no setting"
+"""The mark of a ``NoSetting``, in the field's annotation."""
+NoSetting: TypeAlias = Annotated[T, NO_SETTING]
+"""A field of ``run.json`` that is no setting (see ``settings_of``).
+
+Training writes it, it follows from settings, or it does not change what is learnt.
+"""
 
 
 @dataclass(frozen=True)
@@ -76,7 +106,7 @@ class LevelEntry:
 class SkillEntry:
     """The entry of a skill of the run, or of a hierarchy in it; what is None is absent there."""
 
-    name: NodePath
+    name: NoSetting[NodePath]
     max_steps: AtLeastOne | None
     ready: bool = False
     call_steps: AtLeastOne | None = None
@@ -231,7 +261,7 @@ class StageEntry:
     What is None or empty by default is absent in ``run.json`` then.
     """
 
-    name: NodePath
+    name: NoSetting[NodePath]
     kind: Literal["agent", "skill", "selector", "together"]
     learns: Annotated[list[NodePath], Check("at least one name", bool)]
     """Names of the learners: "agent", "selector" or a skill's name."""
@@ -244,7 +274,7 @@ class StageEntry:
     ]
     target: Target | None
     """A target at which it ends early; None: without target."""
-    status: Literal["waiting", "training", "done"]
+    status: NoSetting[Literal["waiting", "training", "done"]]
     together: dict[str, Any] | None = None
     """Settings of skills and selector learning together; None: one learner, or a population."""
     algorithms: dict[NodePath, dict[str, Any]] = field(default_factory=dict)
@@ -253,9 +283,9 @@ class StageEntry:
     """The weights of skills whose ``task_weight`` differs from the one of ``together``."""
     guide_kl: Positive | None = None
     """The largest KL of the selector to its guide."""
-    compared: bool | None = None
+    compared: NoSetting[bool | None] = None
     """Keep the jointly learnt weights only if they are better than the earlier ones."""
-    greedy_judged: bool | None = None
+    greedy_judged: NoSetting[bool | None] = None
     """At its end, evaluate whether skills and selector should act greedily or sample."""
     evolution: (
         Annotated[
@@ -265,34 +295,34 @@ class StageEntry:
         | None
     ) = None
     """Settings of its population."""
-    workers: Threads = 1
+    workers: NoSetting[Threads] = 1
     """Processes for its environments; parts of its population."""
-    starts: dict[NodePath, Start] = field(default_factory=dict)
+    starts: NoSetting[dict[NodePath, Start]] = field(default_factory=dict)
     """Initial policies from other runs, by learner."""
     repair: RepairEntry | None = None
     """The stage repairs a skill that has learnt before."""
-    continued: list[Count] = field(default_factory=list)
+    continued: NoSetting[list[Count]] = field(default_factory=list)
     """Steps after which the stage had ended, before its budget was raised."""
-    metrics_bytes: Count | None = None
-    lineage_bytes: Count | None = None
-    reached: Reached | None = None
-    stopped: Stopped | None = None
-    best: Best | None = None
-    steps: Count | None = None
+    metrics_bytes: NoSetting[Count | None] = None
+    lineage_bytes: NoSetting[Count | None] = None
+    reached: NoSetting[Reached | None] = None
+    stopped: NoSetting[Stopped | None] = None
+    best: NoSetting[Best | None] = None
+    steps: NoSetting[Count | None] = None
     """Environment steps of the training; None until it is done, as are the next three."""
-    evaluation_steps: Count | None = None
-    seconds: NonNegative | None = None
-    steps_per_second: float | None = None
-    final: dict[str, float | None] = field(default_factory=dict)
+    evaluation_steps: NoSetting[Count | None] = None
+    seconds: NoSetting[NonNegative | None] = None
+    steps_per_second: NoSetting[float | None] = None
+    final: NoSetting[dict[str, float | None]] = field(default_factory=dict)
     """The last metrics."""
-    winner: Winner | None = None
-    succeeded: bool | None = None
+    winner: NoSetting[Winner | None] = None
+    succeeded: NoSetting[bool | None] = None
     """True if any call of the skill succeeded in training or evaluation; None: unknown."""
-    sha256: str | None = None
+    sha256: NoSetting[str | None] = None
     """Checksum of its policy's file."""
-    policies: dict[NodePath, str] = field(default_factory=dict)
+    policies: NoSetting[dict[NodePath, str]] = field(default_factory=dict)
     """With several learners: checksums of their policies' files by name."""
-    kept: Comparison | None = None
+    kept: NoSetting[Comparison | None] = None
     """The result of the comparison at its end."""
 
     @property
@@ -341,9 +371,9 @@ class Recorded:
 
     env: Annotated[str, Check("a text of at most 300 characters", lambda x: len(x) <= 300)]
     env_kwargs: dict[str, Any]
-    code: dict[str, str] = field(default_factory=dict)
+    code: NoSetting[dict[str, str]] = field(default_factory=dict)
     """Texts of the environment and the skills, to be compared (``runs/user_code.py``)."""
-    recipe: str | None = None
+    recipe: NoSetting[str | None] = None
     hierarchy: LevelEntry | None = None
     """The outermost hierarchy; None: a plain agent."""
     skills: list[SkillEntry] = field(default_factory=list)
@@ -365,26 +395,26 @@ class Recorded:
 class Manifest(Recorded):
     """``run.json``."""
 
-    seed: Count
+    seed: NoSetting[Count]
     stages: list[StageEntry]
     checkpoint_every: AtLeastOne
     eval_every: AtLeastOne | None
     eval_episodes: AtLeastOne
     keep: Literal["last", "best"] = "last"
     """The weights that stages end with."""
-    log_info: tuple[str, ...]
+    log_info: NoSetting[tuple[str, ...]]
     """Logged keys of ``info``."""
-    log_calls: AtLeastOne | None = None
+    log_calls: NoSetting[AtLeastOne | None] = None
     """Steps of the log of calls."""
-    log_calls_info: tuple[str, ...] = ()
+    log_calls_info: NoSetting[tuple[str, ...]] = ()
     """Keys of ``info`` in it."""
-    track: tuple[str, ...] = ()
-    needs_recipe: bool
-    resume_needs_recipe: bool
-    created: str = ""
+    track: NoSetting[tuple[str, ...]] = ()
+    needs_recipe: NoSetting[bool]
+    resume_needs_recipe: NoSetting[bool]
+    created: NoSetting[str] = ""
     """The time at which the run was made; empty, as the next two, before that."""
-    versions: dict[str, str] = field(default_factory=dict)
-    id: str = ""
+    versions: NoSetting[dict[str, str]] = field(default_factory=dict)
+    id: NoSetting[str] = ""
 
     @property
     def kind(self) -> Literal["hierarchy", "agent"]:
@@ -542,6 +572,40 @@ def read_manifest(run: Path) -> Manifest:
 
     manifest: Manifest = read_json(file, checked)
     return manifest
+
+
+def settings_of(manifest: Manifest) -> dict[str, Any]:
+    """Return every setting in a manifest by its dotted name, without the seed.
+
+    Runs that differ by their seed alone have equal settings.
+    """
+    values: dict[str, Any] = {"env": manifest.env}
+    values |= flat(manifest.env_kwargs, "env_kwargs.")
+    values["kind"] = manifest.kind
+    if manifest.hierarchy is not None:
+        # Its ready selector and its guide are compared by themselves, as code is.
+        values |= _settings_in(replace(manifest.hierarchy, selector=None, guide=None))
+    for name in _setting_names(Manifest):
+        if name not in ("env", "env_kwargs", "hierarchy", "skills", "stages"):
+            values[name] = getattr(manifest, name)
+    for skill in manifest.skills:
+        values |= flat(_settings_in(skill), f"skills.{skill.name}.")
+    for stage in manifest.stages:
+        values |= flat(_settings_in(stage), f"{stage.name}.")
+        # Which run it starts from differs from seed to seed.
+        values |= {f"{stage.name}.starts.{name}": "another run" for name in stage.starts}
+    return values
+
+
+def _settings_in(entry: LevelEntry | SkillEntry | StageEntry) -> dict[str, Any]:
+    """Return the settings in an entry, as JSON."""
+    names = _setting_names(type(entry))
+    return {name: value for name, value in as_json(entry).items() if name in names}
+
+
+def _setting_names(kind: type) -> tuple[str, ...]:
+    """Return the fields of a class that are not marked as ``NoSetting``."""
+    return tuple(k for k, hint in annotations_of(kind).items() if NO_SETTING not in get_args(hint))
 
 
 OF_NO_WEIGHT = ("recipe", "track", "log_info", "log_calls", "log_calls_info", "code")

@@ -16,11 +16,11 @@ from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError
 from skillweave.policies import selectors
 from skillweave.policies.acting_errors import PolicyError
+from skillweave.policies.core import Step
 from skillweave.policies.selectors import function_name, skill_and_goal
 from skillweave.policies.untrusted import checksum
 from skillweave.schema import Check, fitted
 from skillweave.skills.selector import ReadySelector, checked_function, goal_as_json
-from skillweave.types import Step
 
 Event = Callable[[Step], Any] | str
 """The event of a transition: a function of a ``Step``, (n,) bool, or "success" or "failure"."""

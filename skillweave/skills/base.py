@@ -18,6 +18,7 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave._internal.notebooks import facts, joined
 from skillweave.errors import DeclarationError, SkillError
+from skillweave.policies.core import Array, Step
 from skillweave.policies.parts import Override
 from skillweave.policies.spaces import Space as Data
 from skillweave.schema import (
@@ -34,7 +35,6 @@ from skillweave.skills.outputs import Wrapped, as_array, call_checked, call_user
 from skillweave.skills.own_part import declared_acts, declared_sees
 from skillweave.skills.residual import Residual
 from skillweave.skills.spelling import misspelt
-from skillweave.types import Array, Step
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 """Valid names of skills, which are also names of files."""

@@ -12,6 +12,7 @@ from gymnasium import Space
 
 from skillweave._internal.messages import short, shortened, suggest
 from skillweave.errors import PolicyError
+from skillweave.policies.core import Array
 from skillweave.policies.mapped import (
     Affine,
     Input,
@@ -26,7 +27,6 @@ from skillweave.skills.foreign_policy import made_up
 from skillweave.skills.function_state import examples
 from skillweave.skills.mapping import Acts, Goal, LastAction, Part, PolicyMapping, Source
 from skillweave.skills.outputs import of_numbers
-from skillweave.types import Array
 
 # Inputs
 

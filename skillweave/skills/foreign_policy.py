@@ -12,15 +12,16 @@ from gymnasium import Space
 
 from skillweave._internal.messages import error_text, short
 from skillweave._internal.notices import notice
+from skillweave._internal.policy_protocol import Memoryless, Policy
 from skillweave._internal.tracebacks import is_own_code
 from skillweave.errors import PolicyError, RunError, SkillweaveError
+from skillweave.policies.core import Array
 from skillweave.policies.spaces import at, space_of
 from skillweave.policies.untrusted import checksum
 from skillweave.skills.function_state import examples
 from skillweave.skills.goal_spaces import draw_from
 from skillweave.skills.probing import look_at
 from skillweave.skills.rows import Call
-from skillweave.types import Array, Memoryless, Policy
 
 EXAMPLES = 16
 """The number of example observations on which a policy is tried out."""

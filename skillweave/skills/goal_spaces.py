@@ -12,10 +12,10 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.messages import short
+from skillweave.policies.core import Array
 from skillweave.policies.hierarchy import SKILL
 from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.policies.spaces import Space as Data, at, space_of
-from skillweave.types import Array
 
 
 def with_goal(observation_space: gym.Space[Any], goal_space: gym.Space[Any]) -> gym.spaces.Dict:

@@ -15,6 +15,7 @@ import numpy as np
 from skillweave._internal.messages import short
 from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, EnvError, SkillError, SkillweaveError
+from skillweave.policies.core import Array, Step, read_only
 from skillweave.policies.hierarchy import TRIES, CallGoals
 from skillweave.policies.parts import joined
 from skillweave.policies.spaces import space_of
@@ -22,7 +23,6 @@ from skillweave.skills.base import Skill, path_of
 from skillweave.skills.function_state import untouched
 from skillweave.skills.goal_spaces import alone
 from skillweave.skills.outputs import call_user
-from skillweave.types import Array, Step, read_only
 
 
 def goals_of(skill: Skill | None) -> Goals | None:

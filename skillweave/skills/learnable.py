@@ -12,8 +12,8 @@ from gymnasium import Space
 from gymnasium.spaces import Box
 
 from skillweave.errors import DeclarationError, PolicyError
+from skillweave.policies.core import Array
 from skillweave.skills.goal_spaces import goal_part, other_goals
-from skillweave.types import Array
 
 if TYPE_CHECKING:
     from torch import nn

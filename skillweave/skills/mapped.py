@@ -16,8 +16,9 @@ from gymnasium.spaces import Box, Dict, Tuple
 
 from skillweave._internal.messages import short
 from skillweave._internal.notices import notice
+from skillweave._internal.policy_protocol import Memoryless
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.policies.core import RowPolicy, Turn, World
+from skillweave.policies.core import Array, RowPolicy, Turn, World
 from skillweave.policies.functional import Functional
 from skillweave.policies.mapped import Function, Input, Mapped, Model, numbers_of
 from skillweave.policies.parts import GOAL, OBSERVATION
@@ -31,7 +32,6 @@ from skillweave.skills.mapping import LastAction, PolicyMapping
 from skillweave.skills.outputs import Wrapped, of_numbers
 from skillweave.skills.probing import MOST_BYTES
 from skillweave.skills.rows import largest_difference, other_rows, parts_of, shown
-from skillweave.types import Array, Memoryless
 
 ROUNDING = 0.03
 """The largest difference of outputs, relative to their size, that is rounding: that of 8 bits."""

@@ -11,13 +11,14 @@ from typing import Any, NoReturn, cast
 import numpy as np
 
 from skillweave._internal.messages import error_text, short, suggest
+from skillweave._internal.rewards import LARGEST_REWARD, wrong_reward
 from skillweave._internal.tracebacks import is_users
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
+from skillweave.policies.core import Array, Step, read_only
 from skillweave.policies.floats import by_program
 from skillweave.policies.infos import NUMBERS, Infos
 from skillweave.skills.probing import look_at
 from skillweave.skills.rows import Call
-from skillweave.types import LARGEST_REWARD, Array, Step, read_only, wrong_reward
 
 OF_DICTS = ("no field of name", "dtype([", "VoidDType", "numpy.void")
 """Parts of errors of NumPy about an array of a Dict or Tuple, which is not a plain array."""

@@ -20,7 +20,9 @@ from gymnasium import Space
 from gymnasium.spaces import Box, Dict, Discrete
 
 from skillweave._internal.messages import short, shortened, suggest
+from skillweave._internal.policy_protocol import Policy
 from skillweave.errors import DeclarationError, PolicyError
+from skillweave.policies.core import Array
 from skillweave.policies.mapped import Input
 from skillweave.policies.parts import Correction, Slice
 from skillweave.policies.spaces import Space as Data, space_of
@@ -36,7 +38,6 @@ from skillweave.skills.mapping import (
 )
 from skillweave.skills.outputs import required_arguments
 from skillweave.skills.residual import Residual
-from skillweave.types import Array, Policy
 
 HOLD, ZERO = "hold", "zero"
 """Words for ``Hierarchy.rest``: the value of the last action, and zero."""

@@ -28,6 +28,7 @@ from skillweave._internal.messages import error_text
 from skillweave._internal.notices import notice
 from skillweave._internal.tracebacks import is_own_code
 from skillweave.errors import SkillError, SkillweaveError
+from skillweave.policies.core import Array, read_only
 from skillweave.skills.function_state import MODE, FunctionState
 from skillweave.skills.rows import (
     Call,
@@ -39,7 +40,6 @@ from skillweave.skills.rows import (
     shown,
     sizes_in,
 )
-from skillweave.types import Array, read_only
 
 LOOKS = {4**i: i for i in range(6)}
 """The calls at which a function is looked at, and how many looks there were before.

@@ -10,6 +10,7 @@ from typing import Any
 from gymnasium import Space
 
 from skillweave._internal.messages import short
+from skillweave._internal.policy_protocol import Policy
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.policies.parts import GOAL
 from skillweave.skills.base import Skill, is_trained
@@ -21,7 +22,6 @@ from skillweave.skills.own_part import OwnPart
 from skillweave.skills.residual import Residual, correction, refuse_skill
 from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
-from skillweave.types import Policy
 
 
 def ready_policy(skill: Skill) -> Policy | None:

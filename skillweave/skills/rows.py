@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.types import Array, read_only
+from skillweave.policies.core import Array, read_only
 
 
 @dataclass

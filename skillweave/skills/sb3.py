@@ -16,7 +16,7 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import error_text, short, shortened
 from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, needs_extra
-from skillweave.policies.core import Turn
+from skillweave.policies.core import Array, Turn
 from skillweave.policies.mapped import Mapped, Shapes
 from skillweave.policies.untrusted import check_file, checksum, read_file
 from skillweave.schema import fitted
@@ -24,7 +24,6 @@ from skillweave.skills.foreign_policy import made_up
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of, no_mapping
 from skillweave.skills.mapping import Part, PolicyMapping, Scaling, mapping_of
 from skillweave.skills.torch_module import TorchPolicy
-from skillweave.types import Array
 
 ALGORITHMS = {"PPO": "PPO", "A2C": "PPO", "DQN": "DQN", "SAC": "SAC", "TD3": "TD3", "DDPG": "TD3"}
 """The algorithms of Stable-Baselines3, with those of this library by which a model learns on."""

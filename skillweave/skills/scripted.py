@@ -11,7 +11,7 @@ from gymnasium.spaces import Dict, Tuple
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError, PolicyError
-from skillweave.policies.core import Memory, RowPolicy, Turn
+from skillweave.policies.core import Array, Memory, RowPolicy, Turn, read_only
 from skillweave.policies.mapped import Function
 from skillweave.policies.parts import GOAL
 from skillweave.skills.foreign_policy import qualified
@@ -24,7 +24,6 @@ from skillweave.skills.outputs import (
     parameters_of,
     required_arguments,
 )
-from skillweave.types import Array, read_only
 
 
 class ScriptedPolicy(MappedPolicy):

@@ -16,7 +16,7 @@ from skillweave._internal.messages import shortened
 from skillweave._internal.terminal import one_line
 from skillweave.errors import DeclarationError
 from skillweave.policies import selectors
-from skillweave.policies.core import LastCall
+from skillweave.policies.core import Array, LastCall
 from skillweave.policies.functional import Functional
 from skillweave.policies.parts import GOAL
 from skillweave.policies.selectors import (
@@ -35,7 +35,6 @@ from skillweave.skills.function_state import examples
 from skillweave.skills.goal_spaces import alone
 from skillweave.skills.outputs import Wrapped, call_checked, call_user, required_arguments
 from skillweave.skills.tree import Composite, Condition, Node, Sequence
-from skillweave.types import Array
 
 
 class ReadySelector(Functional, Foreign):

@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from skillweave._internal.policy_protocol import Memoryless
 from skillweave.errors import PolicyError
 from skillweave.policies.core import Choices, RowPolicy, innermost
 from skillweave.policies.functional import Functional, Returns
@@ -20,7 +21,6 @@ from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.lengths import Lengths
 from skillweave.skills.outputs import blame, call_skill
 from skillweave.skills.own_part import OwnPart
-from skillweave.types import Memoryless
 
 
 class LimitedCalls(Choices):

@@ -17,7 +17,7 @@ from gymnasium import Space
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, shortened
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.policies.core import Turn
+from skillweave.policies.core import Array, Turn
 from skillweave.policies.mapped import invoke, of_model, parted, rows_first, states_of
 from skillweave.policies.untrusted import checksum, read_file
 from skillweave.schema import fitted
@@ -25,7 +25,6 @@ from skillweave.skills.foreign_policy import made_up, qualified
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, layers_of, no_mapping
 from skillweave.skills.mapped import MappedPolicy, hidden_state
 from skillweave.skills.mapping import PolicyMapping, mapping_of
-from skillweave.types import Array
 
 if TYPE_CHECKING:
     from torch import nn

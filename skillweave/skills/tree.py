@@ -34,9 +34,9 @@ from typing import Any
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave.errors import DeclarationError
+from skillweave.policies.core import Array
 from skillweave.policies.selectors import Status as Status, function_name, skill_and_goal
 from skillweave.schema import fitted
-from skillweave.types import Array
 
 
 @checked_names

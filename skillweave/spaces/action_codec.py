@@ -14,9 +14,9 @@ from torch import Tensor
 
 from skillweave._internal.messages import short
 from skillweave.errors import EnvError
+from skillweave.policies.core import Array
 from skillweave.policies.spaces import MOST_CHOICES, MOST_OF_ALL
 from skillweave.spaces.packing import check_size, leaf_spaces, obs_dtype, parts
-from skillweave.types import Array
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,12 @@ import numpy as np
 from torch import Tensor
 
 from skillweave.errors import EnvError
+from skillweave.policies.core import Array
 from skillweave.policies.hierarchy import SKILL
 from skillweave.policies.parts import GOAL
 from skillweave.policies.spaces import space_of
 from skillweave.spaces.action_codec import ActionCodec, JointCodec, action_codec
 from skillweave.spaces.packing import obs_dtype
-from skillweave.types import Array
 
 
 class ChoiceSpace(gym.spaces.Dict):

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from skillweave.errors import EnvError
+from skillweave.policies.core import Array
 from skillweave.spaces.packing import (
     LARGEST,
     check_size,
@@ -20,7 +21,6 @@ from skillweave.spaces.packing import (
     obs_dtype,
     obs_shape,
 )
-from skillweave.types import Array
 
 _SMALLEST = 16  # sides of a plain matrix of bytes that is an image
 _WIDEST = 2.0**24

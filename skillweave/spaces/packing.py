@@ -14,8 +14,8 @@ import numpy as np
 
 from skillweave._internal.messages import short
 from skillweave.errors import EnvError
+from skillweave.policies.core import Array
 from skillweave.policies.spaces import at
-from skillweave.types import Array
 
 OBSERVATIONS = "Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of these"
 

@@ -26,6 +26,7 @@ from skillweave.experience.acting import Acting, Request
 from skillweave.experience.collector import Collector
 from skillweave.ops.device import resolve_device
 from skillweave.ops.threads import torch_threads
+from skillweave.policies.core import Array
 from skillweave.policies.untrusted import shown
 from skillweave.runs.initial_policies import initial_policy
 from skillweave.runs.manifest import StageEntry
@@ -42,7 +43,6 @@ from skillweave.training.replay_learner import learner_of
 from skillweave.training.stage import Together
 from skillweave.training.stage_log import StageLog, resumed, success_rate
 from skillweave.training.stage_run import StageRun
-from skillweave.types import Array
 from skillweave.workers.placement import MakeCollectors, make_collectors
 
 EARLY = 0.25

@@ -13,7 +13,7 @@ import torch
 
 from skillweave.errors import TrainingError
 from skillweave.experience.collector import FIRST_INFO
-from skillweave.types import Array
+from skillweave.policies.core import Array
 
 WINDOW = 100  # episodes in the reported means
 INFO = "info/"

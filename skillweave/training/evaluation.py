@@ -17,6 +17,7 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave._internal.notebooks import joined, paragraph, table
 from skillweave._internal.notices import notice
+from skillweave._internal.policy_protocol import Policy
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave._internal.terminal import printable
 from skillweave.envs.checked import longest_evaluation, time_limit
@@ -26,6 +27,7 @@ from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.envs.pool import POOL_SEEDS
 from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.planning.calls import CallLog
+from skillweave.policies.core import Array
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.schema import UNSAVED, AtLeastOne, Count, fitted
 from skillweave.skills import Skill
@@ -48,7 +50,6 @@ from skillweave.training.skill_report import (
     skill_table,
     weak_handovers,
 )
-from skillweave.types import Array, Policy
 
 FIRST_SEED = 1_000_000
 """Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""

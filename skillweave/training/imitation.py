@@ -15,8 +15,8 @@ from skillweave.errors import DeclarationError
 from skillweave.ops.distributions import mask_logits
 from skillweave.ops.optim import adam_
 from skillweave.ops.threads import torch_threads
+from skillweave.policies.core import Array
 from skillweave.spaces import pack, to_tensor
-from skillweave.types import Array
 
 GRADIENT_STEPS, BATCH = 2_000, 256
 LARGE_STEPS, LARGE_BATCH = 1_000, 64

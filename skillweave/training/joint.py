@@ -15,8 +15,8 @@ from skillweave.buffers.rollout import RolloutStore
 from skillweave.experience.acting import Request
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import normalize
+from skillweave.policies.core import Array
 from skillweave.training.learner import Learner, RolloutLearner, Stack
-from skillweave.types import Array
 
 
 class JointLearner:

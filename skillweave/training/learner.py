@@ -19,7 +19,7 @@ from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.batches import Batch, Reference, Rehearsal
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.experience.acting import Request
-from skillweave.types import Array
+from skillweave.policies.core import Array
 
 
 @dataclass

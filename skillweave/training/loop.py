@@ -24,13 +24,13 @@ from skillweave._internal import interrupts
 from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.batches import Batch
-from skillweave.experience.group import Collectors
+from skillweave.experience.group import CollectorGroup
 from skillweave.ops.device import INT
 from skillweave.ops.threads import WorkThread, torch_threads
+from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, Tick, to_numbers
 from skillweave.training.learner import Learner, crossed
-from skillweave.types import Array
 
 CHECKPOINT_SECONDS = 60.0
 """Age of the latest checkpoint in seconds at which the next one is written."""
@@ -98,7 +98,7 @@ class Loop:
     """One stage's training; states of the learner change."""
 
     learner: Learner
-    collectors: Collectors
+    collectors: CollectorGroup
     """Fresh or already started."""
     episodes: Episodes
     """The latest episodes, for the metrics; new ones are added."""

@@ -18,9 +18,9 @@ from skillweave.experience.acting import Acting, Request
 from skillweave.experience.collector import RETURN, SUCCESS, Collector
 from skillweave.experience.learners import Alone, Calling
 from skillweave.ops.threads import torch_threads
+from skillweave.policies.core import Array
 from skillweave.training.learner import crossed
 from skillweave.training.learning_task import LearningTask
-from skillweave.types import Array
 
 
 class PeriodicEvaluation:

@@ -7,11 +7,21 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from skillweave._internal.policy_protocol import Policy
 from skillweave.envs.engine import Engine
 from skillweave.envs.env_infos import allowed_rows
-from skillweave.policies.core import Memory as InPlaceMemory, Turn, World, flat, put, split, take
+from skillweave.policies.core import (
+    Array,
+    Memory as InPlaceMemory,
+    Step,
+    Turn,
+    World,
+    flat,
+    put,
+    split,
+    take,
+)
 from skillweave.skills.skill_set import in_place
-from skillweave.types import Array, Policy, Step
 
 
 @dataclass(slots=True)

@@ -10,19 +10,19 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.paths import AGENT, join, level_of, names_in
+from skillweave._internal.policy_protocol import Memory, Policy
 from skillweave.envs.make import EnvSpec
 from skillweave.experience.views import seen_by, stops
 from skillweave.planning.calls import CallLog
 from skillweave.planning.columns import GOAL, OF_CALL
 from skillweave.planning.recorder import SUMS, Recorder, TraceFeed, calls_in, goals_in, levels_below
-from skillweave.policies.core import EPISODE, LIMIT, OWN, RUNNING, end_with_episode
+from skillweave.policies.core import EPISODE, LIMIT, OWN, RUNNING, Array, end_with_episode
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills import Reflex, Skill, call_method
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.skill_set import SkillSet, skills_below
 from skillweave.training.play import PlayedStep
-from skillweave.types import Array, Memory, Policy
 
 WAITS, IS_DONE = -1, -2
 """In place of the steps of the call of a skill that acts alone."""

@@ -18,12 +18,12 @@ from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.batches import Rehearsal
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.errors import RunError
+from skillweave.policies.core import Array
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import check_unchanged, read_tensors
 from skillweave.runs.manifest import StageEntry
 from skillweave.spaces import to_tensor
 from skillweave.training.learner import RolloutLearner
-from skillweave.types import Array
 
 MOST_BYTES = 2**26
 """The most bytes of observations."""

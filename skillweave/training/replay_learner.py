@@ -17,9 +17,9 @@ from skillweave.algorithms.batches import Batch
 from skillweave.buffers.replay import ReplayStore
 from skillweave.experience.acting import ActionRepeat, Request
 from skillweave.ops.device import resolve_device
+from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
 from skillweave.training.learner import RolloutLearner, Stack, acting_of, member_seeds
-from skillweave.types import Array
 
 DRAWN_AT_ONCE = 8
 """Gradient steps whose samples are drawn at once."""

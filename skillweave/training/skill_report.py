@@ -19,13 +19,12 @@ from skillweave.planning.columns import (
 )
 from skillweave.planning.handover import FEW, LEAST, Handover, pair_counts
 from skillweave.planning.recorder import Recorder
-from skillweave.policies.core import CallEnd
+from skillweave.policies.core import Array, CallEnd
 from skillweave.schema import Check, Count
 from skillweave.skills import is_trained
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.learnable import learn_on
 from skillweave.training.played_calls import PlayedCalls
-from skillweave.types import Array
 
 Ended = Annotated[
     dict[str, Count],

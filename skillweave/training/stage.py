@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from skillweave._internal.notices import notice
 from skillweave._internal.paths import SELECTOR, join
+from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import (
     AlgorithmConfig,
@@ -24,7 +25,6 @@ from skillweave.schema import AtLeastOne, Fraction, NonNegative, Positive, setti
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.replay_learner import store_of
 from skillweave.training.role import Role
-from skillweave.types import Policy
 from skillweave.workers.start_methods import cannot_be_sent, runs_again, why_no_processes
 
 TOGETHER = "together"

@@ -9,6 +9,7 @@ from typing import Any
 from skillweave._internal.interrupts import deferred
 from skillweave._internal.notices import notice
 from skillweave._internal.paths import names_in
+from skillweave._internal.policy_protocol import Policy
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.planning.recorder import Recorder
@@ -21,7 +22,6 @@ from skillweave.training.learning_task import LearningTask
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import StageLog
 from skillweave.training.stage_run import MakeLearner, StageRun
-from skillweave.types import Policy
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from skillweave._internal.messages import error_text, short
 from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, TrainingError, needs_extra
-from skillweave.experience.group import Collectors, MakeCollector, share_of
+from skillweave.experience.group import CollectorGroup, MakeCollector, share_of
 from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, settings
 from skillweave.workers.host import WorkerCollectors, WorkerFactory, Workers
 from skillweave.workers.placement import Placement
@@ -109,8 +109,7 @@ class Ray:
 
             def make_collectors(
                 make: MakeCollector, num_envs: int, workers: int, members: int, name: str
-            ) -> Collectors:
-                """Return collectors in actors, which share the environments."""
+            ) -> CollectorGroup:
                 each = share_of(num_envs, workers, members, name)
                 elsewhere = actor_workers(actors, make, each, workers, name)
                 return WorkerCollectors(elsewhere, each, members, name)

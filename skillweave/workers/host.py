@@ -21,8 +21,8 @@ from skillweave.envs.engine import checksums
 from skillweave.errors import SkillweaveError, TrainingError, kind_of, reworded
 from skillweave.experience.acting import Request
 from skillweave.experience.collector import Collected
-from skillweave.experience.group import Collectors, joined_states, split_states
-from skillweave.types import Array
+from skillweave.experience.group import CollectorGroup, joined_states, split_states
+from skillweave.policies.core import Array
 
 SNAPSHOT_EVERY = 16
 """Requests after which workers say where they stand, so that less need be done again."""
@@ -159,19 +159,31 @@ class Workers:
 
     Args:
         workers: W of them, of one kind.
-        name: the environment's name in messages.
+        name: what messages call the environment.
+        each: environments of a worker, which messages name; 0: it has none of its own.
+        repeated: called with a task and the answers of the workers that were made again and have
+            repeated it, by their numbers; None: nobody needs these.
 
     Raises:
         SkillweaveError: a task failed; the kind is the kind of its error.
         TrainingError: a worker was lost again and again at the same place; the message names it.
     """
 
-    def __init__(self, workers: Sequence[Worker], name: str) -> None:
+    def __init__(
+        self,
+        workers: Sequence[Worker],
+        name: str,
+        each: int = 0,
+        repeated: Callable[[str, dict[int, Any]], None] | None = None,
+    ) -> None:
         self._workers = list(workers)
+        self._repeated = repeated
         for number, worker in enumerate(workers):
-            worker.who = f"{name}: worker {number}{self._whose(number)}"
-        self._past: list[tuple[str, Sequence[Any]]] = []
-        """Tasks that bring a new worker to the present state: a start or states, then requests."""
+            worker.who = f"{name}: worker {number}"
+            if each:
+                worker.who += f" (environments {number * each} to {(number + 1) * each - 1})"
+        self.past: list[tuple[str, Sequence[Any]]] = []
+        """What brings workers to where they stand: a start or states, then tasks."""
         try:
             for worker in self._workers:
                 worker.begin()
@@ -186,20 +198,24 @@ class Workers:
         Args:
             kept: the tasks change where workers stand.
         """
-        path = [*self._past, (what, tasks)]
+        path = [*self.past, (what, tasks)]
         if kept:
-            self._past = path
+            self.past = path
         return self._completed(self._asked(range(len(self._workers)), what, tasks), path)
+
+    def ask_once(self, what: str) -> None:
+        """Ask for something; workers that are lost in it are not made again."""
+        self._asked(range(len(self._workers)), what, [None] * len(self._workers))
 
     def states(self) -> list[dict[str, Array]]:
         """Return the workers' states, from which lost ones are made again from now on."""
         states: list[dict[str, Array]] = self.ask("state", [None] * len(self._workers), kept=False)
-        self._past = [("restore", states)]
+        self.past = [("restore", states)]
         return states
 
     def stand(self, states: Sequence[dict[str, Array]]) -> list[Array]:
         """Restore the open episodes of each worker; return environments that start again."""
-        self._past = []
+        self.past = []
         return self.ask("restore", states)
 
     def close(self) -> None:
@@ -227,12 +243,9 @@ class Workers:
         found = self._received(numbers, must)
         for at, (what, tasks) in enumerate(path, 1):
             found = self._asked(found, what, tasks, must)
-            if at < len(path):
-                self._did_again(what, found)
+            if at < len(path) and self._repeated is not None:
+                self._repeated(what, found)
         return found
-
-    def _did_again(self, what: str, found: dict[int, Any]) -> None:
-        """Return the answers of workers that repeated what lost ones had done."""
 
     def _asked(
         self, numbers: Iterable[int], what: str, tasks: Sequence[Any], must: bool = False
@@ -258,13 +271,9 @@ class Workers:
                 raise reworded(error, f"{error} (in worker {i})") from error
         return found
 
-    def _whose(self, number: int) -> str:
-        """Return words on a worker's environments, for messages."""
-        return ""
 
-
-class WorkerCollectors(Workers, Collectors):
-    """Collectors in workers elsewhere, each with as many environments.
+class WorkerCollectors(CollectorGroup):
+    """Collectors elsewhere, each with as many environments.
 
     Args:
         workers: W of them.
@@ -274,53 +283,35 @@ class WorkerCollectors(Workers, Collectors):
     """
 
     def __init__(self, workers: Sequence[Worker], each: int, members: int, name: str) -> None:
-        self.members = members
-        self.num_envs = each * len(workers)
-        self.steps_made = self.begun_anew = 0
-        self.parts = []
-        self._each = each
+        super().__init__(each * len(workers), members)
+        self._workers = workers
         none = np.empty(0, np.int64)
         self._stands = [none] * len(workers)  # of each, after what was collected last
         self._differ = [none] * len(workers)  # of each, environments that did not repeat themselves
-        super().__init__(workers, name)
+        self._together = Workers(workers, name, each, self._did_again)
 
     def start(self, seeds: Seeds) -> None:
         """Start every environment, unless they have started."""
-        if not self._past:
-            self.ask("start", [seeds / number for number in range(len(self._workers))])
+        if not self._together.past:
+            self._together.ask("start", [seeds / number for number in range(len(self._workers))])
 
     def collect(self, request: Request) -> Collected:
         """Step each environment ``request.rows`` times, and return the joined rows."""
         task = self._workers[0].shared(request)
-        answers: list[Collected] = self.ask("collect", [task] * len(self._workers))
+        answers: list[Collected] = self._together.ask("collect", [task] * len(self._workers))
         self._stands = [answer.stands for answer in answers]  # type: ignore[misc]
         found = replace(self._joined(answers), begun_anew=self.differing())
-        if len(self._past) > SNAPSHOT_EVERY:
-            self.states()
+        if len(self._together.past) > SNAPSHOT_EVERY:
+            self._together.states()
         return found
 
     def state(self) -> dict[str, Array]:
-        """Return the states of all workers' collectors, joined, for ``restore``."""
-        return joined_states(self.states())
+        """Return what ``restore`` needs. Only a worker that is lost meanwhile can change."""
+        return joined_states(self._together.states())
 
     def restore(self, state: dict[str, Array]) -> Array:
         """Restore the open episodes of ``state``; return (k,) environments that start again."""
-        return self._columns(self.stand(split_states(state, len(self._workers))))
-
-    def finish(self) -> None:
-        """Check at the end of training that it has left nothing in the environments.
-
-        A worker that is lost in it is not made again: the training result is there.
-        """
-        self._asked(range(len(self._workers)), "finish", [None] * len(self._workers))
-
-    def _did_again(self, what: str, found: dict[int, Any]) -> None:
-        """Note the environments that a recreated worker could not restore or repeat."""
-        for i, answer in found.items():
-            if what == "restore":
-                self._differ[i] = answer
-            elif what == "collect":
-                self._differ[i] = np.flatnonzero(answer.stands != self._stands[i])
+        return self._columns(self._together.stand(split_states(state, len(self._workers))))
 
     def differing(self) -> Array:
         """Return the environments (k,) that are in another state since a worker was lost."""
@@ -330,6 +321,21 @@ class WorkerCollectors(Workers, Collectors):
         self.begun_anew += len(found)
         return found
 
-    def _whose(self, number: int) -> str:
-        first = number * self._each
-        return f" (environments {first} to {first + self._each - 1})"
+    def finish(self) -> None:
+        """Check at the end of training what it has left in the environments.
+
+        A worker that is lost in it is not made again: the training result is there.
+        """
+        self._together.ask_once("finish")
+
+    def close(self) -> None:
+        """End the workers."""
+        self._together.close()
+
+    def _did_again(self, what: str, found: dict[int, Any]) -> None:
+        """Note which environments of workers that were made again stand elsewhere now."""
+        for i, answer in found.items():
+            if what == "restore":
+                self._differ[i] = answer
+            elif what == "collect":
+                self._differ[i] = np.flatnonzero(answer.stands != self._stands[i])

@@ -6,18 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from skillweave._internal.notices import notice
-from skillweave.experience.group import Collectors, MakeCollector, share_of
+from skillweave.experience.group import CollectorGroup, Collectors, MakeCollector, share_of
 from skillweave.workers.host import LocalWorker, WorkerCollectors, WorkerFactory, Workers
 from skillweave.workers.processes import ProcessWorker
 from skillweave.workers.start_methods import runs_again, why_no_processes
 
-MakeCollectors = Callable[[MakeCollector, int, int, int, str], Collectors]
+MakeCollectors = Callable[[MakeCollector, int, int, int, str], CollectorGroup]
 """Makes collectors, as ``make_collectors`` does."""
 
 
 def make_collectors(
     make: MakeCollector, num_envs: int, workers: int, members: int, name: str
-) -> Collectors:
+) -> CollectorGroup:
     """Make collectors of ``num_envs`` environments: one in this thread, or ``workers`` processes.
 
     Args:

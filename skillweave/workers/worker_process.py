@@ -15,11 +15,10 @@ from typing import Any, NoReturn
 
 from skillweave._internal.interrupts import handle_here
 from skillweave._internal.notices import Notices, collect_notices
+from skillweave._internal.parent_process import when_parent_ends
 from skillweave.workers.channel import Channel
 from skillweave.workers.host import SentError, WorkerHost, error_to_send
 
-LOOK = 1.0
-"""Seconds between checks that the parent lives."""
 GRACE = 5.0
 """Seconds that environments have to close after the parent has ended."""
 LEFT = 0.3
@@ -134,26 +133,18 @@ def _end(number: int, frame: FrameType | None) -> NoReturn:
 def _end_with(parent: int | None) -> None:
     """End this process soon after its parent, also during a rollout.
 
-    A thread checks the parent, because the main thread may be in a long rollout or in an
-    environment that waits. Environments get time to close: they may have processes of their own.
+    Environments get time to close: they may have processes of their own.
     """
-    started_by = mp.parent_process()
-    assert started_by is not None
     main = threading.main_thread().ident
     assert main is not None
-    first = parent or os.getppid()
 
-    def watch() -> None:
-        """Wait until the parent has ended, then end this process and its group."""
-        # is_alive() is late where workers forked later hold copies of its pipe.
-        while started_by.is_alive() and os.getppid() == first:
-            sleep(LOOK)
+    def end() -> None:
         with suppress(OSError, ValueError):
             signal.pthread_kill(main, signal.SIGTERM)
         sleep(GRACE)
         kill_group()
 
-    threading.Thread(target=watch, name="parent", daemon=True).start()
+    when_parent_ends(end, parent)
 
 
 def _may_have_processes() -> None:

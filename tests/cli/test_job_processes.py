@@ -5,10 +5,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
+from living import all_end
 
 from skillweave.cli.jobs import ProcessEnded, Processes
 from skillweave.errors import SkillweaveError
@@ -70,3 +74,30 @@ def test_an_error_here_ends_all_jobs_and_begins_no_other():
         with pytest.raises(ProcessEnded):
             future.result()
     assert time.monotonic() - started < 50
+
+
+PARENT = """
+import os, signal, sys, time
+from test_job_processes import announced
+from skillweave.cli.jobs import Processes
+if __name__ == "__main__":
+    with Processes(1) as pool:
+        pool.submit(announced, sys.argv[1])
+        while not os.path.exists(sys.argv[1]):
+            time.sleep(0.1)
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def announced(file: str) -> None:
+    """Write its process's id, and stay."""
+    Path(file).write_text(str(os.getpid()))
+    time.sleep(300)
+
+
+def test_a_job_ends_soon_after_its_parent_was_killed(tmp_path):
+    (tmp_path / "parent.py").write_text(PARENT)
+    paths = {"PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, str(tmp_path / "parent.py"), str(tmp_path / "pid")]
+    assert subprocess.run(command, env=os.environ | paths).returncode == -signal.SIGKILL
+    assert all_end([int((tmp_path / "pid").read_text())])

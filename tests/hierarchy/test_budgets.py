@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from itertools import product
+
 import pytest
 
 from skillweave import (
@@ -177,3 +180,56 @@ def test_a_weight_of_a_hierarchy_holds_for_the_skills_in_it():
 def test_lengths_learn_together_too():
     (stage,) = declare(call_steps=Lengths(4, 8), selector=PPO()).stages()
     assert stage.kind == "together"
+
+
+LEARN = ("together", "apart", "apart, then together")
+
+
+def replaced_steps(declared: Hierarchy, steps: int) -> Hierarchy:
+    """A copy with other steps."""
+    other = copy.copy(declared)
+    other.steps = steps
+    return other
+
+
+def own_budgets(learn: str, which: tuple[bool, ...], inner: str | None, ready: bool) -> Hierarchy:
+    """A hierarchy, perhaps with another one in it, some of whose parts have their own steps."""
+    skill_steps, selector_steps, together_steps, one_steps, inner_steps = which
+    one = One()
+    one.steps = 400 if one_steps else None
+    skills: list[Skill | Hierarchy] = [one, Ready()]
+    how: dict[str, object] = {
+        "learn": learn,
+        "apart": Apart(
+            skill_steps=500 if skill_steps else None,
+            selector_steps=600 if selector_steps else None,
+        ),
+        "together": Together(steps=700 if together_steps else None),
+    }
+    if inner is not None:
+        below = Hierarchy("CartPole-v1", [Two(), Ready()], name="inner", **how | {"learn": inner})
+        if inner_steps and below.budgets() != replaced_steps(below, 800).budgets():
+            below.steps = 800
+        skills[1] = below
+    if ready:
+        how["selector"] = lambda obs: obs[:, 0] > 0
+    return Hierarchy("CartPole-v1", skills, **how)
+
+
+@pytest.mark.fast_cases(4)
+@pytest.mark.parametrize("learn", LEARN)
+@pytest.mark.parametrize("inner", [None, *LEARN])
+def test_steps_mean_something_where_a_part_has_none_of_its_own(learn, inner):
+    seen = set()
+    for which in product((True, False), repeat=5):
+        declared = own_budgets(learn, which, inner, ready=which[0] != which[3])
+        before = declared.budgets()
+        declared = replaced_steps(declared, 7_000_000)
+        changed = declared.budgets() != before
+        seen.add(changed)
+        if changed:
+            declared.validate()
+        else:
+            with pytest.raises(SkillweaveError, match="all its parts have steps of their own"):
+                declared.validate()
+    assert seen == {True, False}

@@ -19,11 +19,12 @@ from reference_calls import EPISODE
 from toy_acting import Again, Choices, Mortal, deciding, equal, requests, stepping
 from toys import alone_in
 
+from skillweave._internal import parent_process
 from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.experience.group import Collectors
-from skillweave.workers import processes, worker_process
+from skillweave.workers import processes
 from skillweave.workers.placement import make_collectors
 
 
@@ -144,7 +145,7 @@ def test_processes_that_are_not_forked_get_the_users_code_and_stay(
     for collectors in (ours, theirs):
         collectors.start(Seeds(3))
     for i, request in enumerate(itertools.islice(requests(2), 2)):
-        time.sleep(1.5 * worker_process.LOOK * i)  # they look whether their parent lives
+        time.sleep(1.5 * parent_process.LOOK * i)  # they look whether their parent lives
         same(ours.collect(request), theirs.collect(request))
     assert [worker.process.pid for worker in theirs._workers] == pids
 

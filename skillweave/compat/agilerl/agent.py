@@ -25,10 +25,10 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.mutation import with_settings
 from skillweave.evolution.stacks import Member, copy
 from skillweave.networks.config import CNN, Network
+from skillweave.policies.core import Array
 from skillweave.policies.untrusted import check_file, shown
 from skillweave.runs.files import read_tensors, record_in, write_tensors
 from skillweave.spaces import to_tensor
-from skillweave.types import Array
 
 MLP: dict[str, Any] = {"arch": "mlp", "hidden_size": [64, 64]}
 ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "SiLU": "silu", "GELU": "gelu"}

@@ -12,8 +12,8 @@ from skillweave.compat.agilerl.agent import MLP, AgilerlAgent, Setting, tensor_o
 from skillweave.compat.numpy_actor import NumpyActor
 from skillweave.errors import DeclarationError
 from skillweave.evolution.stacks import Member
+from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
-from skillweave.types import Array
 
 
 class PPO(AgilerlAgent):

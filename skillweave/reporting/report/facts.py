@@ -13,11 +13,9 @@ from typing import Any
 
 from skillweave._internal.paths import level_of
 from skillweave.planning.handover import wilson
-from skillweave.policies.core import flat
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import LevelEntry, Manifest, StageEntry
-from skillweave.schema import as_json
+from skillweave.runs.manifest import LevelEntry, StageEntry
 from skillweave.skills import Skill
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.skill_report import SkillReport, Words, all_steps
@@ -69,35 +67,6 @@ def span(bounds: Iterable[Any], say: Callable[[float], str] = percent) -> str:
 
 
 # Runs and stages
-
-RESULTS = {
-    "name",
-    "status",
-    "starts",
-    "final",
-    "sha256",
-    "policies",
-    "metrics_bytes",
-    "lineage_bytes",
-    "winner",
-    "steps",
-    "seconds",
-    "steps_per_second",
-    "evaluation_steps",
-    "reached",
-    "kept",
-    "workers",
-    "succeeded",
-    "compared",
-    "greedy_judged",
-    "stopped",
-    "best",
-    "continued",
-}
-"""Fields of a stage's entry that are no settings: training wrote them, or they follow from the
-hierarchy's settings."""
-OF_CODE = ("selector", "guide")
-"""Fields of the outermost hierarchy's entry that are no settings."""
 
 
 def name_of(run: RunDirectory) -> str:
@@ -190,24 +159,6 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
             f"it: {command_words('resume', run)}"
         )
     return sentences
-
-
-def settings(manifest: Manifest) -> dict[str, Any]:
-    """Return every setting in a run's manifest by its dotted name, without seed and results."""
-    values: dict[str, Any] = {"env": manifest.env} | flat(manifest.env_kwargs, "env_kwargs.")
-    level = as_json(manifest.hierarchy) or {}
-    values |= {"kind": manifest.kind} | {k: level[k] for k in level if k not in OF_CODE}
-    names = ("checkpoint_every", "eval_every", "eval_episodes", "keep")
-    values |= {name: getattr(manifest, name) for name in names}
-    for skill in manifest.skills:
-        fields = {k: v for k, v in as_json(skill).items() if k != "name"}
-        values |= flat(fields, f"skills.{skill.name}.")
-    for entry in manifest.stages:
-        fields = {k: v for k, v in as_json(entry).items() if k not in RESULTS}
-        # From which run differs from seed to seed.
-        fields |= {f"starts.{name}": "another run" for name in entry.starts}
-        values |= flat(fields, f"{entry.name}.")
-    return values
 
 
 def plain(value: Any) -> str:

@@ -14,12 +14,12 @@ import numpy as np
 from skillweave.envs.engine import GymnasiumEngine, RawStep
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
+from skillweave.policies.core import Array
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import without_screen
 from skillweave.reporting.video import enlarged, frame_of
 from skillweave.reporting.video_file import VideoWriter
 from skillweave.training.played_calls import Episode
-from skillweave.types import Array
 
 MOST_FRAMES = 1_500
 MOST_BYTES = 2_800_000  # as text in the page a third more

@@ -10,10 +10,10 @@ import numpy as np
 
 from skillweave._internal.paths import join
 from skillweave.planning import CallLog
+from skillweave.policies.core import Array
 from skillweave.reporting.report import charts
 from skillweave.reporting.report.facts import percent
 from skillweave.skills import Skill
-from skillweave.types import Array
 
 MOST_GOALS = 40
 """The most goals that have a bar each."""

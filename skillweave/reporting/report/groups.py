@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from skillweave.errors import DeclarationError
+from skillweave.policies.core import Array
 from skillweave.reporting.report import facts
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import settings_of
 from skillweave.training.evaluation import interquartile_means
-from skillweave.types import Array
 
 
 @dataclass
@@ -42,7 +43,7 @@ def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
         raise DeclarationError("no runs were given; name at least one run's directory")
     by_settings: dict[str, Group] = {}
     for run in runs:
-        settings = facts.settings(run.manifest)
+        settings = settings_of(run.manifest)
         key = json.dumps([run.manifest.recipe, settings], sort_keys=True, default=str)
         turn, at = divmod(len(by_settings), 26)  # A to Z, then A2, B2 and so on
         letter = chr(ord("A") + at) + (str(turn + 1) if turn else "")

@@ -17,6 +17,7 @@ from skillweave.errors import EnvError
 from skillweave.planning import CallLog, Handover
 from skillweave.planning.handover import CallEnds, before_each
 from skillweave.planning.neighbors import evenly
+from skillweave.policies.core import Array
 from skillweave.policies.spaces import space_of
 from skillweave.reporting.report import charts
 from skillweave.reporting.report.facts import WHY, WORDS, number, percent, scale_of, span
@@ -27,7 +28,6 @@ from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.goals import goals_of
 from skillweave.training.skill_report import end_cells
-from skillweave.types import Array
 
 MOST_FRAMES = 1_200
 MOST_FILMED = 4 * MOST_FRAMES

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave._internal.paths import AGENT
+from skillweave._internal.policy_protocol import Policy
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.envs.make import EnvSpec
 from skillweave.planning.columns import ENDS
@@ -48,6 +49,7 @@ from skillweave.reporting.report.timelines import (
 )
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
+from skillweave.runs.manifest import settings_of
 from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
@@ -56,7 +58,6 @@ from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 from skillweave.training.play import PlayedStep as PlayedStep
 from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 from skillweave.training.skill_report import levels_of, skill_rows
-from skillweave.types import Policy
 
 EPISODES = 20
 """Episodes that a report plays by default."""
@@ -265,7 +266,7 @@ def _add_words(page: Page, run: RunDirectory, reached: Mapping[str, int]) -> Non
         "kind": "plain agent" if manifest.hierarchy is None else "hierarchy",
         "facts": facts.facts(run),
         "stages": facts.stage_rows(run, reached),
-        "settings": [(k, facts.plain(v)) for k, v in facts.settings(manifest).items()],
+        "settings": [(k, facts.plain(v)) for k, v in settings_of(manifest).items()],
         "steps": sum(
             reached.get(entry.name, 0) if entry.steps is None else entry.steps
             for entry in manifest.stages

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from skillweave.envs.obs_names import ObsNames
+from skillweave.policies.core import Array
 from skillweave.reporting.report.film import Mp4
 from skillweave.training.played_calls import Episode, PlayedEpisodes
-from skillweave.types import Array
 
 MOST_COORDINATES = 16
 LARGEST_VECTOR = 64  # numbers of an observation; of a larger one (an image) none is a coordinate

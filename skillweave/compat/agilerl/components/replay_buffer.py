@@ -10,7 +10,7 @@ from skillweave.algorithms.batches import Batch, Sample
 from skillweave.buffers.replay import ReplayStore
 from skillweave.compat.agilerl.agent import random_seed
 from skillweave.ops.device import FLOAT
-from skillweave.types import Array
+from skillweave.policies.core import Array
 
 
 class MultiStepReplayBuffer:
