@@ -74,19 +74,6 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> sw.Run:
     return crane(selector=in_turn, rest="hold").train(folder, quiet=True)
 
 
-def test_the_rest_is_held():
-    run = crane(selector=in_turn, rest=("hold", 0.25, "hold")).train(quiet=True)
-    actions, _ = actions_of(run.policy)
-    assert (actions[:4, 2] == 0).all()  # nothing was done before
-    assert (actions[4:8, 0] == actions[3, 0]).all()
-    assert (actions[4:8, 1] == 0.25).all()
-    assert (actions[8:12, 2] == actions[7, 2]).all()
-    assert actions[3, 0] != 0
-    assert actions[7, 2] != 0
-    again, _ = actions_of(run.policy)
-    assert (again == actions).all()  # nothing is left of the episode before
-
-
 @pytest.mark.parametrize("skill", ["arm", "hook"])
 def test_a_skill_alone_acts_as_in_the_hierarchy(skill, held):
     actions = acted(held.player(skill=skill))
@@ -195,44 +182,6 @@ def test_a_skill_starts_with_what_it_learnt_on_its_part(learnt):
     again = crane([Arm(), Hook()], learn="apart", steps=200, rest=0.5)
     run = again.train(start_from=learnt, quiet=True)
     assert "arm" in run.info()["stages"][0]["starts"]
-
-
-def test_several_skills_own_the_same_part():
-    other = type("Other", (Arm,), {})()
-    run = crane([Arm(), other, Hook()]).train(quiet=True)
-    assert run.evaluate(2).returns
-
-
-def test_the_last_action_passes_into_a_hierarchy_below():
-    class Lower(sw.Skill):
-        """Lowers the hook."""
-
-        acts = 2
-
-        def policy(self, obs):
-            return np.full((len(obs), 1), -0.5, np.float32)
-
-    class Swing(sw.Skill):
-        """Swings the arm."""
-
-        acts = (0, 1)
-
-        def policy(self, obs):
-            return np.full((len(obs), 2), 0.25, np.float32)
-
-    inner = crane([Lower()], selector=lambda obs: np.full(len(obs), "lower"), rest="hold")
-    inner.name = "inner"
-    turns = functools.partial(named_turns, names=("swing", "inner"))
-    run = crane([Swing(), inner], selector=turns, rest="hold").train(quiet=True)
-    actions, names = actions_of(run.policy)
-    assert names[4] == "inner/lower"
-    assert (actions[:4] == [0.25, 0.25, 0.0]).all()
-    assert (actions[4:8] == [0.25, 0.25, -0.5]).all()
-    assert (actions[8:12] == [0.25, 0.25, -0.5]).all()
-
-
-def named_turns(obs: Any, names: tuple[str, str]) -> Any:
-    return np.where(obs["camera"][:, 0, 0, 0] // 4 % 2 == 0, *names)
 
 
 @pytest.mark.slow
@@ -355,13 +304,6 @@ def test_calls_come_first_and_the_rest_is_held_on(tmp_path):
     assert (held == -0.5).mean() > 0.5
 
 
-def test_masks_are_cut_to_the_part():
-    run = crane([Arm(), type("Free", (sw.Skill,), {})()], env=on("several", True)).train(quiet=True)
-    env = Crane("several", True)
-    for (action,) in episode(env, run.player(skill="free")):
-        assert env._info()["action_mask"][action[0]]
-
-
 def test_a_mask_that_forbids_the_rest_is_an_error():
     with pytest.raises(SkillError, match=r"skill 'hook'.*forbids the value 0 at place 0.*rest"):
         crane([Hook()], env=on("several", True)).train(quiet=True)
@@ -383,16 +325,6 @@ def test_a_population_learns_parts(tmp_path):
     evolve = {"arm": Evolution(population=2, generations=2)}
     run = crane(**how).train(tmp_path / "run", evolve=evolve, quiet=True)
     assert run.policy.skills.policies[0].action_space.shape == (2,)
-
-
-def test_options_env_calls_skills_with_parts(held):
-    env = sw.make_options_env(held, 2, 0.99)
-    env.reset(seed=0)
-    before = env.engine.steps_made
-    *_, info = env.step(np.array([0, 1]))
-    assert info["steps"].tolist() == [4, 4]
-    assert env.engine.steps_made == before + 8
-    env.close()
 
 
 def test_calls_are_logged(held):
