@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from goals.worlds import SPACES, GoTo, Point, Rest, go_to, place_of
+from goals.worlds import GoTo, Point, Rest, go_to, place_of
 from playing import alike, loaded_of, runner_of
 from test_networks import agent
 
