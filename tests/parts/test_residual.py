@@ -152,66 +152,6 @@ def test_a_population_learns_corrections():
     assert run.evaluate(2).returns
 
 
-@pytest.mark.parametrize(
-    ("policy", "scale", "says"),
-    [
-        (None, 0.2, "Residual.policy is None; it must be a function of observations"),
-        (middle, 0.0, "Residual.scale is 0.0; it must be a number over 0"),
-        (middle, (0.1, -0.2), "Residual.scale is"),
-        (sw.Residual(middle), 0.2, "Residual.policy is Residual"),
-    ],
-)
-def test_what_is_no_correction(policy, scale, says):
-    with pytest.raises(DeclarationError, match=says):
-        sw.Residual(policy, scale)
-
-
-class Ready(sw.Skill):
-    def policy(self, obs):
-        return middle(obs)
-
-
-READY = r"and no policy: give what acts in that skill, {}\.policy"
-LEARNS = r"a skill that learns, and no policy: train .* run\.policy"
-
-
-@pytest.mark.parametrize(
-    ("skill", "says"),
-    [
-        (Ready, "is the class Ready, " + READY.format(r"Ready\(\)")),
-        (Ready(), "is the skill 'ready', " + READY.format("skill")),
-        (Arm, "is the class Arm, " + LEARNS),
-        (Arm(), "is the skill 'arm', " + LEARNS),
-    ],
-)
-def test_a_skill_is_no_policy(skill, says):
-    with pytest.raises(DeclarationError, match=rf"^Residual\.policy {says}$"):
-        sw.Residual(skill)
-    as_policy = type("Better", (sw.Skill,), {"policy": skill})
-    with pytest.raises(DeclarationError, match=rf"skill 'better': policy {says}$"):
-        crane([as_policy()]).train(quiet=True)
-
-
-def test_what_learns_on_is_not_corrected():
-    module = sw.from_torch(nn.Sequential(nn.Linear(3, 3)), learn=True)
-    with pytest.raises(DeclarationError, match=r"with learn=True.*leave out learn"):
-        sw.Residual(module)
-
-
-@pytest.mark.parametrize(
-    ("skill", "env", "says"),
-    [
-        (declared(lambda obs: np.zeros(len(obs), int)), "one", "needs a Box.*Discrete"),
-        (declared(middle, (0.1, 0.2)), "box", "scale has 2 numbers, but the action has 3"),
-        (declared(5), "box", "skill 'better': policy is 5, which cannot act"),
-    ],
-)
-def test_what_does_not_fit_is_refused_before_training(skill, env, says):
-    world = sw.EnvSpec(lambda: Crane(env), engine="sync", workers=1)
-    with pytest.raises(DeclarationError, match=says):
-        crane([skill], env=world).train(quiet=True)
-
-
 def test_what_has_a_policy_is_not_one():
     ready = crane([Arm()], steps=130).train(quiet=True)
     with pytest.raises(DeclarationError, match=r"has a policy, but is none.*\.policy"):

@@ -13,7 +13,7 @@ from playing import episode
 from small_runs import goes_on, reports_every
 
 import skillweave as sw
-from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
+from skillweave.errors import RunError, SkillError
 from skillweave.evolution import Evolution
 from skillweave.hierarchy.roles import roles_of
 from skillweave.runs.directory import RunDirectory
@@ -195,27 +195,6 @@ def test_a_nested_hierarchy_learns(learn, tmp_path):
     goes_on(hierarchy, tmp_path)
 
 
-def test_a_hierarchy_has_no_part_of_its_own():
-    inner = crane([Arm(), Hook()], name="inner")
-    part = type("Part", (sw.Skill,), {"policy": inner, "acts": (0, 1)})()
-    with pytest.raises(DeclarationError, match="a hierarchy, so it has no acts of its own"):
-        crane([part])
-
-
-def test_a_rest_that_means_nothing_is_refused():
-    every = type("Every", (sw.Skill,), {})()
-    with pytest.raises(DeclarationError, match="rest is 'hold', but no skill writes a part"):
-        crane([every], rest="hold")
-    with pytest.raises(DeclarationError, match="rest is 'keep'; it must be"):
-        crane(rest="keep")
-
-
-def test_what_does_not_exist_is_refused_before_training():
-    wrong = type("Arm", (Arm,), {"acts": (0, 3)})()
-    with pytest.raises(DeclarationError, match=r"skill 'arm': acts.*does not exist"):
-        crane([wrong, Hook()]).train(quiet=True)
-
-
 def test_ready_skills_have_parts(tmp_path):
     class Push(sw.Skill):
         """Pushes the arm back to the middle."""
@@ -243,12 +222,6 @@ def test_ready_skills_have_parts(tmp_path):
         wanted = -0.5 * obs["arm"] if skill == "push" else 0.25 * obs["hook"] + 0.5
         assert np.allclose(action[numbers], np.clip(wanted, -1, 1))
         assert np.count_nonzero(action) == np.count_nonzero(wanted)
-
-
-def test_a_ready_policy_of_another_shape_is_refused():
-    wrong = type("Arm", (Arm,), {"policy": staticmethod(lambda obs: np.zeros((len(obs), 3)))})()
-    with pytest.raises(PolicyError, match=r"skill 'arm'.*\(2, 2\) was expected"):
-        crane([wrong]).train(quiet=True)
 
 
 class Sideways(sw.Skill):
@@ -310,13 +283,6 @@ def test_a_mask_that_forbids_the_rest_is_an_error():
     # Zero of place 0 is forbidden in some steps, one in others, two never.
     run = crane([Hook()], env=on("several", True), rest=(2, 0, 0)).train(quiet=True)
     assert run.evaluate(1).returns
-
-
-def test_a_mask_that_leaves_no_choice_is_an_error():
-    low = type("Low", (Arm,), {"acts": (0,)})()
-    free = type("Free", (sw.Skill,), {})()
-    with pytest.raises(SkillError, match=r"skill 'low'.*allows none of the choices"):
-        crane([low, free], env=on("one", True)).train(quiet=True)
 
 
 @pytest.mark.slow
