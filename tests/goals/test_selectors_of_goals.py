@@ -50,7 +50,7 @@ def test_ready_selectors_give_goals(name):
 SPACE_NAMES = [name for name in SPACES if name != "picture"]
 
 
-@pytest.mark.fast_cases(2 * len(SPACE_NAMES))
+@pytest.mark.fast_cases(len(SPACE_NAMES))
 @pytest.mark.parametrize("space", SPACE_NAMES)
 @pytest.mark.parametrize("learn", ["apart", "together", "apart, then together"])
 def test_a_selector_learns_skill_and_goal(space, learn):
@@ -62,7 +62,7 @@ def test_a_selector_learns_skill_and_goal(space, learn):
     run.evaluate(3, deterministic=False)
 
 
-@pytest.mark.fast_cases(4)
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("learn", ["apart", "together"])
 @pytest.mark.parametrize("space", ["box", "number", "numbers"])
 def test_an_interrupted_run_ends_with_the_same_weights(learn, space, tmp_path):
@@ -74,7 +74,8 @@ def test_an_interrupted_run_ends_with_the_same_weights(learn, space, tmp_path):
     goes_on(hierarchy, tmp_path)
 
 
-@pytest.mark.parametrize("learn", ["apart", "together"])
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("learn", ["together", "apart"])
 def test_skills_with_goals_inside(learn, tmp_path):
     def hierarchy():
         how = {"selector": SELECTOR, "learn": learn, "train_defaults": OFTEN}
@@ -93,7 +94,7 @@ def test_chosen_lengths_and_goals():
     run.evaluate(3, deterministic=False)
 
 
-@pytest.mark.fast_cases(6)
+@pytest.mark.fast_cases(3)
 @pytest.mark.parametrize(
     "selector",
     [
@@ -111,7 +112,7 @@ def test_a_selector_with_values_chooses_discrete_goals(selector, space, tmp_path
 
     def hierarchy(learn="apart"):
         skills = [Sometimes(), go_to(space)]
-        return declared(skills, selector=selector, learn=learn, steps=900, train_defaults=OFTEN)
+        return declared(skills, selector=selector, learn=learn, steps=600, train_defaults=OFTEN)
 
     whole = goes_on(hierarchy, tmp_path, 4)
     assert sw.load(whole.path, hierarchy()).evaluate(3).returns == whole.evaluate(3).returns

@@ -170,7 +170,7 @@ def louder(policy: Any) -> Any:
     return HierarchyPolicy(louder(policy.selector), below, None, policy.goals)
 
 
-@pytest.mark.fast_cases(4)
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("case", WITH_GOALS)
 def test_skills_with_goals_and_parts(case: str, tmp_path: Any) -> None:
     selector, rest, make = WITH_GOALS[case]

@@ -63,7 +63,7 @@ def bases() -> dict[str, Any]:
     }
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", bases())
 @pytest.mark.parametrize("how", ["together", "apart", "SAC"])
 def test_a_stopped_run_ends_with_the_same_weights(name, how, tmp_path):

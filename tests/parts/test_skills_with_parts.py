@@ -101,7 +101,7 @@ def skills_for(kind: str) -> Any:
     return [left, right, type("All", (sw.Skill,), {})()]
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
     kind, how = ALGORITHMS[name]

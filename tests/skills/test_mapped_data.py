@@ -53,7 +53,7 @@ BOTH = Space("Dict", parts={"a": box(2), "b": choice(2)})
         (lambda: Take("goal", (2,), low=np.zeros(3)), r"Take.low has the shape \(3,\)"),
         (lambda: Take("last_action", (2, 2)), r"Take.shape is \(2, 2\)"),
         (lambda: Input((SEEN,), (4,)), r"Input.shape is \(4,\), but Input.takes gives 3"),
-        (lambda: Input((SEEN,), (3,), (Affine(np.zeros(2)),)), "Linear.offset has the shape"),
+        (lambda: Input((SEEN,), (3,), (Affine(np.zeros(2)),)), "Affine.offset has the shape"),
         (lambda: Outputs(box(3), (0, 0), rest=np.zeros(3)), "Outputs.to is .*each one once"),
         (lambda: Outputs(box(3), (0,)), "Outputs.rest must give"),
         (lambda: Outputs(box(3), (0,), rest=np.zeros(2)), "Outputs.rest has the shape"),
