@@ -92,6 +92,17 @@ def few_episodes() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def short_forecasts() -> Iterator[None]:
+    """A plan is forecast by a few episodes, each time that one is made."""
+    from skillweave.planning import forecast
+
+    assert forecast.EPISODES == 200, "as usual_forecasts has it"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(forecast, "EPISODES", 20)
+        yield
+
+
 @pytest.fixture
 def usual_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who learnt together is judged by as many episodes as users have."""
@@ -99,6 +110,12 @@ def usual_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(select_best, "MOST", 100)
     monkeypatch.setattr(select_best, "LEAST", 100)
+
+
+@pytest.fixture
+def usual_forecasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plans are forecast by as many episodes as for users."""
+    monkeypatch.setattr("skillweave.planning.forecast.EPISODES", 200)
 
 
 @pytest.fixture(autouse=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import threading
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -17,14 +18,23 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from goals import worlds as goals
+from parts import crane
 from safetensors.torch import load_file
 from toys import World
 
 import skillweave as sw
 from skillweave import recipes
 from skillweave._internal.messages import ELSEWHERE, RECORDINGS, STARTS
+from skillweave.algorithms.agent_policy import make_algorithm
+from skillweave.envs import one_of
+from skillweave.envs.make import make_engine
 from skillweave.errors import KINDS, SkillError, SkillweaveError
+from skillweave.networks.encoders import CellsEncoder
+from skillweave.policies.sessions import open_session
 from skillweave.skills.selector import FunctionSelector
+from skillweave.spaces import obs_codec
+from skillweave.workers.shipping import packed
 
 SMALL = sw.PPO(num_envs=4, n_steps=32, batch_size=32)
 FAST: dict[str, Any] = {"steps": 256, "learn": "apart", "algorithm": SMALL, "selector": SMALL}
@@ -618,3 +628,222 @@ def test_looking_for_a_forgotten_axis_does_not_change_training(
     plain = weights("runs/plain")
     assert plain.keys() == probed.keys()
     assert all(torch.equal(plain[name], probed[name]) for name in plain)
+
+
+# Goals, parts, corrections, and what is wrong with one argument alone
+
+POINT = goals.Point.observation_space
+BYTES = gym.spaces.Box(0, 255, (2,), np.uint8)
+NESTED = gym.spaces.Dict({"at": gym.spaces.Box(-1, 1, (2,), np.float32), "byte": BYTES})
+GO = "go_to"
+
+
+def goes(chooses: Any, space: Any = "box") -> Any:
+    """Evaluate a selector of a skill with goals, and one without."""
+    made = goals.go_to()
+    type(made).goal_space = goals.SPACES[space] if isinstance(space, str) else space
+    if space is NESTED:
+        type(made).reward = lambda self, step: step.goal["at"].sum(1)
+        type(made).termination = type(made).success = lambda self, step: step.goal["at"][:, 0] > 9
+    return goals.declared([made, goals.Rest()], selector=chooses).train(quiet=True).evaluate(2)
+
+
+def fits(*skills: Any, **how: Any) -> None:
+    """Check a hierarchy whose skills have goals."""
+    goals.declared(list(skills) or [goals.go_to(), goals.Rest()], **how).check_spaces()
+
+
+def each(name: Any, *given: Any) -> Any:
+    """A selector of one skill everywhere, perhaps with goals."""
+    return lambda obs: (np.full(len(obs), name), *given) if given else np.full(len(obs), name)
+
+
+def options(actions: Any) -> Any:
+    """Take actions in an OptionsEnv of two environments."""
+    run = goals.declared([goals.go_to(), goals.Rest()]).train(quiet=True)
+    env = sw.envs.make_options_env(run, 2, 0.9)
+    env.reset(seed=0)
+    return env.step(actions)
+
+
+def sighted(sees: Any) -> None:
+    """Check a network of a skill with goals that sees so much."""
+    fits(goals.go_to(), algorithm=sw.PPO(network=sw.Network((8,), sees=sees)))
+
+
+def at(goal: Any, *more: Any) -> Any:
+    """An automaton whose states each go to a fixed goal."""
+    states = {str(i): (GO, place) for i, place in enumerate((goal, *more))}
+    return sw.Automaton(states, {})
+
+
+def cranes(*skills: Any, env: Any = ("box",), **how: Any) -> Any:
+    """Train a crane's skills, which have parts."""
+    world = sw.EnvSpec(lambda: crane.Crane(*env), engine="sync", workers=1)
+    return crane.crane(list(skills), env=world, **how).train(quiet=True)
+
+
+def arm(**members: Any) -> Any:
+    return type("Arm", (crane.Arm,), members)()
+
+
+def middle(obs: Any) -> Any:
+    return np.concatenate([-0.5 * obs["arm"], -0.25 * obs["hook"]], axis=1)
+
+
+TWO = {"at": np.zeros((1, 2)), "side": np.zeros(1, int)}
+WIDE = {"skill": [0, 0], "goal": {GO: np.zeros((2, 3))}}
+IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
+    # Goals that a selector gives
+    ("SkillError", lambda: goes(each(GO)), "chose skill 'go_to' without a goal"),
+    ("SkillError", lambda: goes(lambda obs: (each(GO)(obs), obs[0])), "gave goals of shape"),
+    ("SkillError", lambda: goes(lambda obs: (each(GO)(obs), obs + 9)), "is out of goal_space"),
+    ("SkillError", lambda: goes(each("rest", {"rest": 1})), "'rest', which has no goals"),
+    ("SkillError", lambda: goes(each("goto", np.zeros((1, 2)))), "'goto', which is no skill"),
+    ("SkillError", lambda: goes(each(GO, {"go": np.zeros((1, 2))})), "'go', which is no skill"),
+    ("SkillError", lambda: goes(sw.Automaton({"a": GO}, {})), "write ('go_to', goal)"),
+    ("SkillError", lambda: goes(sw.tree.Sequence((GO, (1.0, 2.0, 3.0)))), "gave goals of shape"),
+    ("SkillError", lambda: goes(at((0.5, (0.5, 1)))), "which are no goals of Box"),
+    ("SkillError", lambda: goes(at(lambda obs: None)), "returned None, but goals"),
+    ("SkillError", lambda: goes(lambda obs: (GO, (0.5, -0.5))), "return (names, goals)"),
+    ("SkillError", lambda: goes(lambda obs: [(GO, 0.5)] * len(obs)), "(names, goals)"),
+    ("SkillError", lambda: goes(lambda obs: ([GO] * len(obs), 0.5, 1)), "(names, goals)"),
+    ("SkillError", lambda: goes(each(GO, {"at": TWO["at"]}), "dict"), "'at', 'side' was expected"),
+    ("SkillError", lambda: goes(each(GO, {**TWO, "sid": 0}), "dict"), "['at', 'side', 'sid']"),
+    ("SkillError", lambda: goes(each(GO, (0, 1, 2)), "tuple"), "a tuple of 2 parts"),
+    ("SkillError", lambda: goes(at((0.5, 1.0), (1.0, 2.0, 3.0))), "goals of shape (1, 3)"),
+    # Whole numbers of goals do not wrap around
+    ("SkillError", lambda: goes(at((300, 300)), BYTES), "gave the goal [300, 300]"),
+    ("SkillError", lambda: goes(at((-1, 7)), BYTES), "gave the goal [-1, 7]"),
+    ("SkillError", lambda: goes(at((257, 0)), "bits"), "gave the goal [257, 0]"),
+    ("SkillError", lambda: goes(at((3, 2**40)), "numbers"), "gave the goal [3, 1099511627776]"),
+    (
+        "SkillError",
+        lambda: goes(lambda obs: ([GO] * len(obs), np.tile((300, 1), (len(obs), 1))), BYTES),
+        "gave the goal [300, 1]",
+    ),
+    (
+        "SkillError",
+        lambda: goes(at(lambda obs: np.tile((257, 0), (len(obs), 1))), "bits"),
+        "gave the goal [257, 0]",
+    ),
+    ("SkillError", lambda: goes(at({"at": (0.5, 0.5), "byte": (300, 1)}), NESTED), "part 'byte'"),
+    ("SkillError", lambda: goes(at({"at": (0.5, 0.5), "byte": (1.5, 1)}), NESTED), "whole numbers"),
+    ("SkillError", lambda: goes(at({"at": (0.5, 0.5), "byte": (1, 2, 3)}), NESTED), "of shape"),
+    # Goals in an OptionsEnv
+    ("DeclarationError", lambda: options([0, 1]), "goals for 'go_to'"),
+    (
+        "DeclarationError",
+        lambda: options({"skill": [0], "goal": {GO: np.zeros((2, 2))}}),
+        "are [0]",
+    ),
+    (
+        "DeclarationError",
+        lambda: options({"skill": [0, 2], "goal": {GO: [[0, 0]] * 2}}),
+        "2 is no skill",
+    ),
+    ("SkillError", lambda: options(WIDE), "shape (2, 3) for skill 'go_to'"),
+    # Selectors, skills and spaces of goals
+    ("DeclarationError", lambda: fits(selector=sw.DQN()), "DQN cannot choose goals of Box"),
+    ("DeclarationError", lambda: fits(goals.go_to("number"), selector=sw.TD3()), "TD3 cannot"),
+    ("DeclarationError", lambda: fits(goals.go_to("picture"), selector=sw.PPO()), "PPO cannot"),
+    (
+        "SkillError",
+        lambda: fits(goals.Rest(), selector=lambda obs: (["rest"] * len(obs), obs)),
+        "but no skill",
+    ),
+    ("DeclarationError", lambda: fits(skill(goal_space=3)), "goal_space is 3"),
+    ("DeclarationError", lambda: fits(skill(clip_goal=lambda s, o, g: g)), "set goal_space"),
+    (
+        "DeclarationError",
+        lambda: fits(skill(goal_space=gym.spaces.Graph(gym.spaces.Discrete(2), None))),
+        "is not supported",
+    ),
+    (
+        "DeclarationError",
+        lambda: fits(
+            selector=goals.SELECTOR,
+            guide=sw.Guide(sw.Automaton({"a": {(GO, (0.5, 0.5)), "rest"}}, {})),
+        ),
+        "guide: it gives a goal",
+    ),
+    ("DeclarationError", lambda: sighted((0, 1)), "network.sees leaves out the goal"),
+    ("DeclarationError", lambda: sighted("observation"), "network.sees leaves out the goal"),
+    ("DeclarationError", lambda: sighted(("observatoin", "goal")), "is 'observation' meant"),
+    ("PolicyError", lambda: fits(goals.go_to(policy=lambda self, obs: obs)), "takes no goal"),
+    ("DeclarationError", lambda: fits(goals.go_to(policy=lambda s, o: o)), "takes (s, o), which"),
+    # Parts and corrections
+    ("DeclarationError", lambda: crane.crane([skill(policy=crane.crane(), acts=0)]), "no acts of"),
+    ("DeclarationError", lambda: cranes(skill(), rest="hold"), "no skill writes a part"),
+    ("DeclarationError", lambda: cranes(arm(), rest="keep"), "rest is 'keep'; it must be"),
+    ("DeclarationError", lambda: cranes(arm(acts=(0, 3))), "does not exist"),
+    ("PolicyError", lambda: cranes(arm(policy=lambda s, o: np.zeros((len(o), 3)))), "was expected"),
+    ("SkillError", lambda: cranes(arm(acts=(0,)), skill(), env=("one", True)), "allows none of"),
+    ("DeclarationError", lambda: sw.Residual(None), "must be a function of observations"),
+    ("DeclarationError", lambda: sw.Residual(middle, 0.0), "Residual.scale is 0.0"),
+    ("DeclarationError", lambda: sw.Residual(middle, (0.1, -0.2)), "Residual.scale is"),
+    ("DeclarationError", lambda: sw.Residual(sw.Residual(middle)), "Residual.policy is Residual"),
+    ("DeclarationError", lambda: sw.Residual(goals.Rest), "is the class Rest"),
+    ("DeclarationError", lambda: sw.Residual(goals.Rest()), "is the skill 'rest'"),
+    ("DeclarationError", lambda: sw.Residual(crane.Arm), "is the class Arm"),
+    ("DeclarationError", lambda: sw.Residual(arm()), "a skill that learns, and no policy"),
+    ("DeclarationError", lambda: cranes(skill(policy=arm())), "is the skill 'arm'"),
+    (
+        "DeclarationError",
+        lambda: sw.Residual(sw.from_torch(torch.nn.Linear(3, 3), learn=True)),
+        "leave out learn",
+    ),
+    (
+        "DeclarationError",
+        lambda: cranes(skill(policy=sw.Residual(lambda obs: [0])), env=("one",)),
+        "needs a Box",
+    ),
+    (
+        "DeclarationError",
+        lambda: cranes(skill(policy=sw.Residual(middle, (0.1, 0.2)))),
+        "the action has 3",
+    ),
+    ("DeclarationError", lambda: cranes(skill(policy=sw.Residual(5))), "is 5, which cannot act"),
+    # One argument alone
+    (
+        "DeclarationError",
+        lambda: make_algorithm(sw.PPO(epsilon=0.1), POINT, POINT),
+        "epsilon needs discrete actions",
+    ),
+    (
+        "DeclarationError",
+        lambda: sw.PPO(
+            learning_rate=sw.algorithms.Linear(1, 0), learning_rate_schedule="kl", target_kl=0.1
+        ),
+        "which adapts a number",
+    ),
+    ("EnvError", lambda: make_engine(sw.EnvSpec(World), 10**9), "1,000,000,000 environments"),
+    ("EnvError", lambda: make_engine(sw.EnvSpec(World, engine="envpool"), 2), "EnvPool cannot run"),
+    ("DeclarationError", lambda: one_of("CartPole-v1"), "one_of() got 'CartPole-v1'"),
+    ("PolicyError", lambda: open_session(b"\x10\0\0\0ORTM" + b"\0" * 40, "it"), "cannot be run"),
+    ("DeclarationError", lambda: CellsEncoder(obs_codec(POINT)), "images of whole numbers"),
+    ("DeclarationError", lambda: sw.EnvSpec(World, obs_names=["x", "x"]), "obs_names"),
+    ("DeclarationError", lambda: declare().train(resume=True), "name its directory"),
+    (
+        "PolicyError",
+        lambda: sw.from_torch(torch.nn.Linear(4, 2)).act({}, np.eye(4, dtype="f4")),
+        "has no spaces yet",
+    ),
+    (
+        "PolicyError",
+        lambda: sw.evaluate(sw.from_torch(torch.nn.Linear(3, 2)), "CartPole-v1", episodes=1),
+        "fails on observations",
+    ),
+    ("EnvError", lambda: obs_codec(gym.spaces.Box(0, 1, (0,))), "holds no number"),
+    (
+        "DeclarationError",
+        lambda: packed({"a": threading.Lock()}, "the arm"),
+        "the arm cannot be sent",
+    ),
+]
+"""The kind of the error, what is done, and words of its message."""
+
+
+@pytest.mark.parametrize(("kind", "mistake", "words"), IN_ROOMS)
+def test_a_mistake_in_a_room_is_an_error_that_names_the_thing(kind, mistake, words):
+    assert_refused(KINDS[kind], words, mistake)

@@ -22,15 +22,23 @@ NEEDS = {
     "docs/tutorials/other-libraries.md": ("stable_baselines3",),
 }
 """What a page's code needs beside the core."""
+LONG = ("docs/algorithms/dqn.md", "docs/algorithms/index.md")
+"""Pages whose code takes ten times as long as that of the others beside them."""
 
 
 def name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
+def with_code() -> list[Path]:
+    """The pages with code, long ones last."""
+    pages = [page for page in PAGES if BLOCK.search(page.read_text())]
+    return sorted(pages, key=lambda page: name(page) in LONG)
+
+
 @pytest.mark.filterwarnings("ignore:start from .* the dict kwargs")  # start-from.md says so
-@pytest.mark.fast_cases(4)
-@pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=name)
+@pytest.mark.fast_cases(2)
+@pytest.mark.parametrize("page", with_code(), ids=name)
 def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     for module in NEEDS.get(name(page), ()):
         pytest.importorskip(module)

@@ -1,16 +1,20 @@
-"""Every field of every settings class refuses wrong values by its name, and takes NumPy's numbers.
+"""Each field of each settings class refuses what its annotation does not allow, by its name.
 
-The tables say what each field must be. They are written by hand, so that an annotation which is
-lost or loosened fails here.
+Values outside are drawn from the annotations: numbers beside the bounds that a check states in
+words, and values of other kinds. What an annotation allows is decided by ``takes``, beside the
+library's own ``fitted``.
 """
 
 from __future__ import annotations
 
+import random
+import re
 import typing
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
 import gymnasium as gym
 import numpy as np
@@ -27,276 +31,21 @@ from skillweave.algorithms.config import (
     config_to_json,
 )
 from skillweave.errors import DeclarationError, RunError
-from skillweave.evolution import Evolution, Mutations, Range, Tournament, Truncation
-from skillweave.schema import described, fitted
+from skillweave.evolution import Evolution, Mutations, Range, Tournament
+from skillweave.schema import Check, annotations_of, described, fitted
 
 if TYPE_CHECKING:
     from fractions import Fraction as Unknown
 
 NAN, INF = float("nan"), float("inf")
-HUGE = 10**400
-NOT_A_NUMBER: tuple[Any, ...] = (True, "x", None, NAN, [1], {}, HUGE)
-
-
-class Kind(NamedTuple):
-    """What a field must be."""
-
-    refused: tuple[Any, ...]
-    taken: tuple[Any, ...]
-
-
-def number(low: float | None = None, high: float | None = None, *, zero: bool = True) -> Kind:
-    """A number from ``low`` to ``high``, both included but for 0 where ``zero`` is False."""
-    below = () if low is None else (low - 0.5, -INF) if zero or low else (-0.5, 0.0, 0, -INF)
-    above = (INF, 1e39) if high is None else (high + 0.5, INF)
-    one = 0.5 if high is None or high >= 0.5 else high
-    edges = tuple(x for x in (low, high) if x is not None and (zero or x))
-    return Kind((*NOT_A_NUMBER, *below, *above), (one, np.float32(one), np.float64(one), *edges))
-
-
-def whole(low: int, high: int | None = None) -> Kind:
-    """A whole number from ``low`` to ``high``."""
-    most = 2**63 if high is None else high + 1
-    one = max(low, 8) if high is None else min(max(low, 8), high)
-    return Kind((*NOT_A_NUMBER, INF, 2.5, 8.0, low - 1, most), (one, np.int64(one), np.int32(one)))
-
-
-def word(*known: str) -> Kind:
-    """One of some texts."""
-    return Kind(("x", 1, True, None, [], b"x"), (*known, np.str_(known[0])))
-
-
-def listed(each: Kind, *refused: Any, some: tuple[Any, ...]) -> Kind:
-    """A tuple or a list of some kind."""
-    wrong = tuple((*some, one) for one in each.refused)
-    numbers = np.asarray(some)
-    return Kind((5, "x", True, None, *refused, *wrong), (some, list(some), tuple(numbers)))
-
-
-def or_none(kind: Kind) -> Kind:
-    """The same, or None."""
-    refused = tuple(x for x in kind.refused if x is not None)
-    return Kind(refused, (*kind.taken, None))
-
-
-def settings(*taken: Any) -> Kind:
-    """Other settings, and no class of them."""
-    return Kind((5, "x", True, None, [], {"x": 1}, type(taken[0])), taken)
-
-
-POSITIVE, NON_NEGATIVE, FRACTION, ANY = number(0, zero=False), number(0), number(0, 1), number()
-SHARE = number(0, 1, zero=False)
-AT_LEAST_ONE, COUNT = whole(1), whole(0)
-FLAG = Kind((0, 1, "x", None, NAN, []), (True, False, np.bool_(True)))
-COMPILE = Kind((0, 1, "x", None, [True]), (True, False, "auto", np.bool_(False)))
-DEVICE = word("cpu", "cuda", "auto")
-WIDTHS = listed(whole(1, 65_536), some=(16, 8, 8))
-NETWORK = settings(sw.Network((8,)), {"hidden": [8]})
-RATE = Kind(
-    (*NOT_A_NUMBER, 0, -1.0, INF, (1, 2), {"start": 1}, {"start": 1, "end": -1}),
-    (0.5, np.float64(0.5), 1, sw.algorithms.Linear(1e-3, 0), {"start": 1e-3, "end": 0.0}),
-)
-LIMITS = Kind(
-    (5, "x", None, (1,), (1, 2, 3), (0, 2), (True, 2), (1, 2.5), (3, 2)),
-    ((1, 2), [1, 2], (np.int64(1), np.int64(2))),
-)
-SEES = Kind(
-    (
-        1.5,
-        -1,
-        True,
-        "",
-        (),
-        (1, 1),
-        (0, -1),
-        (0, True),
-        (0, None),
-        slice(0, None),
-        slice(-2, 3),
-        slice(0, 0),
-        range(0),
-        np.array([0.5]),
-        {"x": 1},
-    ),
-    ((0, 1, 4), [0, 1, 4], ("x", 1, "y.z")),
-)
-NUMBERS = Kind(
-    (True, "x", {}, NAN, INF, [], [NAN], [[0.5]], HUGE), (0.5, np.float64(0.5), [0.5, 1.0])
-)
-RANGE = Kind((5, "x", True, [], (1.0,), (1.0, -1.0), (0.0, INF)), ([-1.0, 1.0], None))
-PLACES = Kind(
-    (0.5, "x", "1:y", True, [], [-1], [0.5], [[0]], {}, slice(0.5), range(0), np.array(0.5)),
-    ([0, 2], slice(0, 3), None),
-)
-SCALING = {"scale": NUMBERS, "offset": NUMBERS, "clip": RANGE}
-ALGORITHM = settings(sw.PPO(), sw.DQN())
-INFO_KEYS = Kind((5, "x", None, {"x": 1}, [5], [""], [None]), (["x"], ("x", "y"), []))
-ENV = Kind((5, True, None, [], {}, gym.Env()), ("CartPole-v1", sw.EnvSpec("CartPole-v1")))
-
-MILLION, THREADS = whole(1, 1_000_000), whole(1, 1024)
-ON_POLICY = {
-    "num_envs": MILLION, "n_steps": MILLION, "learning_rate": RATE, "gamma": FRACTION,
-    "normalize_obs": FLAG, "network": NETWORK, "overlap": FLAG, "threads": THREADS,
-    "device": DEVICE,
-}  # fmt: skip
-PPO = ON_POLICY | {
-    "batch_size": AT_LEAST_ONE, "update_epochs": MILLION,
-    "learning_rate_schedule": word("constant", "linear"), "adam_eps": POSITIVE,
-    "gae_lambda": FRACTION, "clip_coef": POSITIVE, "clip_value": or_none(POSITIVE),
-    "ent_coef": NON_NEGATIVE, "ent_coef_final": or_none(NON_NEGATIVE), "epsilon": FRACTION,
-    "epsilon_final": or_none(FRACTION), "epsilon_fraction": FRACTION, "vf_coef": NON_NEGATIVE,
-    "max_grad_norm": POSITIVE, "target_kl": or_none(POSITIVE), "normalize_advantage": FLAG,
-    "min_advantage_std": NON_NEGATIVE, "normalize_returns": FLAG, "action_std_init": POSITIVE,
-    "action_std": word("parameter", "state"), "squash_actions": FLAG, "critic": or_none(NETWORK),
-    "compile": COMPILE,
-}  # fmt: skip
-OFF_POLICY = {
-    "num_envs": Kind(MILLION.refused, (8, np.int64(8))), "train_freq": AT_LEAST_ONE,
-    "update_ratio": POSITIVE,
-    "buffer_size": Kind(whole(1, 10**9).refused, (1000, np.int64(1000))), "learning_starts": COUNT,
-    "batch_size": whole(1, 1_000_000), "n_step": MILLION, "prioritized": FLAG,
-    "priority_alpha": FRACTION, "priority_beta": FRACTION, "learning_rate": RATE,
-    "learning_rate_schedule": word("constant", "linear"), "adam_eps": POSITIVE, "gamma": FRACTION,
-    "tau": FRACTION, "max_grad_norm": or_none(POSITIVE), "normalize_obs": FLAG,
-    "normalize_rewards": FLAG, "network": NETWORK, "save_buffer": FLAG, "overlap": FLAG,
-    "action_repeat": FRACTION, "action_repeat_steps": MILLION, "threads": THREADS,
-    "compile": COMPILE, "device": DEVICE,
-}  # fmt: skip
-ACTOR_CRITIC = OFF_POLICY | {"critic": or_none(NETWORK)}
-TABLE: dict[type[Any], dict[str, Kind]] = {
-    OnPolicy: ON_POLICY,
-    sw.PPO: PPO,
-    sw.algorithms.SelfImitationPPO: PPO | {
-        "imitation_rows": whole(1, 10**9), "imitation_steps": MILLION,
-        "imitation_coef": NON_NEGATIVE, "imitation_vf_coef": NON_NEGATIVE,
-    },
-    SkillCritic: ON_POLICY | {
-        "batch_size": AT_LEAST_ONE, "update_epochs": MILLION, "gae_lambda": FRACTION,
-        "adam_eps": POSITIVE, "max_grad_norm": POSITIVE, "deciding": FLAG, "sees_goals": FLAG,
-        "min_advantage_std": NON_NEGATIVE, "epsilon": FRACTION, "epsilon_final": or_none(FRACTION),
-        "epsilon_fraction": FRACTION,
-    },
-    OffPolicy: OFF_POLICY,
-    ActorCritic: ACTOR_CRITIC,
-    sw.DQN: OFF_POLICY | {
-        "double": FLAG, "dueling": FLAG, "noisy": FLAG, "distributional": FLAG,
-        "n_atoms": whole(2, 100_000), "v_min": or_none(ANY), "v_max": or_none(ANY),
-        "exploration_fraction": FRACTION, "exploration_initial_eps": FRACTION,
-        "exploration_final_eps": FRACTION, "target_update_interval": AT_LEAST_ONE,
-        "loss": word("huber", "mse"),
-    },
-    sw.TD3: ACTOR_CRITIC | {
-        "exploration_noise": NON_NEGATIVE, "policy_delay": AT_LEAST_ONE,
-        "target_noise": NON_NEGATIVE, "target_noise_clip": NON_NEGATIVE, "twin": FLAG,
-        "actor_rate": POSITIVE, "action_l2": NON_NEGATIVE,
-    },
-    sw.SAC: ACTOR_CRITIC | {
-        "ent_coef": POSITIVE, "learn_ent_coef": FLAG, "target_entropy": or_none(ANY),
-        "policy_delay": AT_LEAST_ONE,
-    },
-    sw.algorithms.Linear: {"start": NON_NEGATIVE, "end": NON_NEGATIVE},
-    sw.algorithms.CNN: {
-        "kind": word("plain", "impala"), "channels": WIDTHS, "kernels": WIDTHS, "strides": WIDTHS,
-    },
-    sw.algorithms.RNN: {"kind": word("lstm", "gru"), "size": whole(1, 65_536)},
-    sw.Network: {
-        "hidden": WIDTHS, "activation": word("tanh", "relu", "elu", "silu", "gelu"),
-        "layer_norm": FLAG, "cnn": or_none(settings(sw.algorithms.CNN(), {"kind": "impala"})),
-        "rnn": or_none(settings(sw.algorithms.RNN(), {"size": 4})),
-        "encoder": or_none(Kind((5, True, None, [], NAN), ("cells",))),
-        "sees": or_none(SEES),
-        "planes": or_none(word("first", "last")),
-    },
-    sw.Part: SCALING | {
-        "key": Kind((5, True, None, []), ("x",)), "places": PLACES, "one_hot": FLAG,
-    },
-    sw.Goal: SCALING | {"low": or_none(NUMBERS), "high": or_none(NUMBERS)},
-    sw.LastAction: SCALING,
-    sw.Acts: SCALING | {"to": PLACES, "rest": or_none(NUMBERS)},
-    sw.Apart: {
-        "skill_steps": or_none(AT_LEAST_ONE), "selector_steps": or_none(AT_LEAST_ONE),
-        "start_calls": or_none(AT_LEAST_ONE), "search_steps": or_none(AT_LEAST_ONE),
-        "episode_calls": AT_LEAST_ONE,
-    },
-    sw.Together: {
-        "steps": or_none(AT_LEAST_ONE), "interrupt": FLAG, "task_weight": NON_NEGATIVE,
-        "epsilon": FRACTION, "epsilon_final": FRACTION, "epsilon_fraction": FRACTION,
-        "margin": NON_NEGATIVE, "reference_kl": or_none(POSITIVE), "quota": FRACTION,
-    },
-    sw.Selection: {
-        "call_cost": NON_NEGATIVE, "greedy_skills": or_none(FLAG), "greedy_selector": or_none(FLAG),
-        "target_return": or_none(ANY),
-    },
-    sw.Guide: {
-        "selector": Kind((5, "x", True, None, []), (np.sign,)), "restrict": FLAG,
-        "target_kl": or_none(POSITIVE),
-    },
-    sw.TrainDefaults: {
-        "eval_every": or_none(AT_LEAST_ONE), "eval_episodes": AT_LEAST_ONE,
-        "checkpoint_every": AT_LEAST_ONE, "keep": word("last", "best"),
-        "log_info": INFO_KEYS,
-        "log_calls": or_none(AT_LEAST_ONE),
-        "log_calls_info": INFO_KEYS,
-        "flat": or_none(ALGORITHM),
-    },
-    Range: {"low": ANY, "high": ANY, "scale": word("linear", "log")},
-    Mutations: {
-        **dict.fromkeys(("none", "hyperparameters", "parameters", "architecture", "activation"),
-                        Kind(FRACTION.refused, ())),
-        "ranges": or_none(Kind((5, "x", True, None, [], {"gamma": 3}, {5: Range(1, 2)}),
-                               ({"gamma": Range(0.5, 0.9)}, {}))),
-        "strength": NON_NEGATIVE, "share": FRACTION, "step": FRACTION, "layer_share": FRACTION,
-        "layers": LIMITS, "units": LIMITS, "channels": LIMITS, "kernels": LIMITS,
-        "activations": Kind((5, "x", None, (), ("x",), (1,)), (("tanh",), ["relu", "elu"])),
-    },
-    Tournament: {"size": AT_LEAST_ONE, "elitism": FLAG},
-    Truncation: {"share": number(0, 0.5, zero=False)},
-    Evolution: {
-        "population": AT_LEAST_ONE, "generations": AT_LEAST_ONE, "episodes": AT_LEAST_ONE,
-        "target": or_none(ANY), "start": word("config", "random"),
-        "selection": Kind((5, "x", None, []), (Truncation(), Tournament(3))),
-        "mutations": settings(Mutations()),
-    },
-    sw.workers.Ray: {
-        "collectors": or_none(AT_LEAST_ONE),
-        "address": or_none(Kind((5, True, None, []), ("auto",))), "cpus": POSITIVE,
-        "patience": NON_NEGATIVE,
-    },
-    sw.EnvSpec: {
-        "env": Kind((5, True, None, [], {}, gym.Env()), ("CartPole-v1", gym.Env)),
-        "kwargs": Kind((5, "x", None, [], {5: 1}), ({"x": 1}, {})),
-        "wrappers": Kind((5, "x", None, ("x",), (None,)), ((gym.Wrapper,), [gym.Wrapper])),
-        "engine": word("auto", "envpool", "sync"), "workers": or_none(AT_LEAST_ONE),
-        "pool": or_none(Kind((5, "x", None, []), (sw.envs.envpool,))),
-        "obs_names": or_none(Kind((5, "x", None, [5], {"x": "y"}, {"x": [5]}),
-                                  (["x", "y"], {"x": ["y"]}))),
-        "check_seed": FLAG,
-    },
-    sw.Agent: {
-        "env": ENV,
-        "algorithm": ALGORITHM, "steps": AT_LEAST_ONE, "target_return": or_none(ANY),
-        "target_success": or_none(SHARE), "train_defaults": settings(sw.TrainDefaults()),
-    },
-    sw.Hierarchy: {
-        "env": ENV,
-        "call_steps": or_none(Kind(AT_LEAST_ONE.refused, (*AT_LEAST_ONE.taken, sw.Lengths(1, 2)))),
-        "steps": or_none(AT_LEAST_ONE), "learn": word("together", "apart", "apart, then together"),
-        "algorithm": ALGORITHM, "selector": settings(sw.PPO(), np.sign),
-        "apart": settings(sw.Apart()), "together": settings(sw.Together()),
-        "selection": settings(sw.Selection()), "guide": or_none(Kind((5, "x", None, []), ())),
-        "train_defaults": settings(sw.TrainDefaults()),
-        "name": Kind((5, None, True, []), ("walk",)),
-    },
-}  # fmt: skip
-"""By class and field, what is refused and what is taken."""
-IN_PARTS = {sw.Hierarchy: {"skills", "reflexes", "predicates", "features", "rest"}}
-"""Fields that have tests of their own."""
 
 
 class Stay(sw.Skill):
     max_steps = 3
 
 
+PUBLIC = [getattr(import_module(m), name) for m, homes in HOMES.items() for name in homes]
+CHECKED = [k for k in PUBLIC if isinstance(k, type) and hasattr(k, "_checks_fields")]
 NEEDED: dict[type[Any], dict[str, Any]] = {
     sw.algorithms.Linear: {"start": 1.0, "end": 0.0},
     Range: {"low": 0.25, "high": 4.0, "scale": "linear"},
@@ -305,11 +54,57 @@ NEEDED: dict[type[Any], dict[str, Any]] = {
     sw.Agent: {"env": "CartPole-v1", "algorithm": sw.PPO(), "steps": 8},
     sw.Hierarchy: {"env": "CartPole-v1", "skills": [Stay()]},
 }
-"""Arguments without which a class cannot be made, or that let one field be changed alone."""
+"""Arguments without which a class cannot be made."""
+KINDS = list(dict.fromkeys([*CHECKED, *NEEDED, OffPolicy, ActorCritic, SkillCritic, Mutations]))
+OWN_TESTS = {"skills", "reflexes", "predicates", "features", "rest"}
+"""Fields of a hierarchy that have tests of their own."""
+FIELDS = [
+    (kind, f.name)
+    for kind in KINDS
+    for f in fields(kind)
+    if f.init and not (kind is sw.Hierarchy and f.name in OWN_TESTS)
+]
+
+ODD: tuple[Any, ...] = (
+    *(True, False, 0, 1, 5, -1, 0.5, 2.5, 8.0, -1.0, NAN, INF, -INF, 1e39, 2**63, 10**400),
+    *("x", "", b"x", None, [], [1], ["x", 5], (), {}, {"x": 1}, {5: 1}, object(), gym.Env()),
+)
+"""Values of all kinds."""
+_NUMBERS: tuple[Any, ...] = (True, "x", {}, NAN, INF, [], [NAN], [[0.5]], 10**400)
+_PLACES: tuple[Any, ...] = (
+    *(0.5, "x", "1:y", True, [], [-1], [0.5], [[0]], {}, slice(0.5), range(0), np.array(0.5)),
+)
+_SEES: tuple[Any, ...] = (
+    *(1.5, -1, True, "", (), (1, 1), (0, -1), (0, True), (0, None), range(0), np.array([0.5])),
+    *(slice(0, None), slice(-2, 3), slice(0, 0), {"x": 1}),
+)
+_LIMITS: tuple[Any, ...] = ((1,), (1, 2, 3), (0, 2), (True, 2), (1, 2.5), (3, 2))
+BY_RULE: dict[tuple[Any, str], tuple[Any, ...]] = {
+    (sw.Network, "sees"): _SEES,
+    **{(sw.Part, name): _NUMBERS for name in ("scale", "offset")},
+    **{(sw.Goal, name): _NUMBERS for name in ("low", "high")},
+    (sw.Acts, "rest"): _NUMBERS,
+    (sw.LastAction, "clip"): (5, "x", True, [], (1.0,), (1.0, -1.0), (0.0, INF)),
+    (sw.Part, "places"): _PLACES,
+    (sw.Acts, "to"): _PLACES,
+    **{(Mutations, name): _LIMITS for name in ("layers", "units", "channels", "kernels")},
+    (Mutations, "ranges"): (5, "x", True, [], {"gamma": 3}, {5: Range(1, 2)}),
+    (Evolution, "selection"): (5, "x", None, []),
+    (sw.PPO, "learning_rate"): (0, -1.0, (1, 2), {"start": 1}, {"start": 1, "end": -1}),
+    (sw.PPO, "network"): (sw.Network,),
+    (sw.Hierarchy, "algorithm"): (sw.PPO,),
+    (sw.EnvSpec, "obs_names"): ([5], {"x": "y"}, {"x": [5]}),
+}
+"""Wrong values of fields whose rule is a function, or stands beside the annotation."""
+UNBOUNDED = {
+    *((sw.DQN, "v_min"), (sw.DQN, "v_max"), (Range, "low"), (Range, "high")),
+    *((sw.SAC, "target_entropy"), (Evolution, "target")),
+    *((sw.Selection, "target_return"), (sw.Agent, "target_return")),
+}
+"""Numbers that may be any."""
 BESIDE: dict[tuple[type[Any], str], dict[str, Any]] = {
     (sw.DQN, "v_min"): {"v_max": 9.0},
     (sw.DQN, "v_max"): {"v_min": -9.0},
-    (Range, "low"): {"high": 2.0},
     (sw.Hierarchy, "selector"): {"learn": "apart"},
 }
 """Fields without which another field cannot be set."""
@@ -320,28 +115,102 @@ def make(kind: type[Any], name: str, value: Any) -> Any:
     return kind(**(NEEDED.get(kind, {}) | BESIDE.get((kind, name), {}) | {name: value}))
 
 
-FIELDS = [(kind, name) for kind, table in TABLE.items() for name in table]
-
-
 def ids(part: Any) -> str:
     return part.__name__ if isinstance(part, type) else str(part)
 
 
-@pytest.mark.parametrize("kind", TABLE, ids=ids)
-def test_the_table_has_every_field(kind):
-    assert set(TABLE[kind]) | IN_PARTS.get(kind, set()) == {f.name for f in fields(kind) if f.init}
+def notes(kind: Any) -> list[Check]:
+    """The checks of an annotation, not of those inside."""
+    return [x for x in get_args(kind)[1:] if isinstance(x, Check)] if is_annotated(kind) else []
 
 
-def test_the_table_has_every_public_class_of_settings():
-    public = [getattr(import_module(m), name) for m, homes in HOMES.items() for name in homes]
-    checked = {k for k in public if isinstance(k, type) and hasattr(k, "_checks_fields")}
-    assert len(checked) > 20
-    assert checked <= set(TABLE)
+def is_annotated(kind: Any) -> bool:
+    return get_origin(kind) is Annotated
+
+
+def inside(kind: Any) -> tuple[Any, ...]:
+    """The annotation's own kind, and all that it is made of."""
+    return (kind, *(x for part in get_args(kind) for x in inside(part)))
+
+
+def bounds(kind: Any) -> list[tuple[float, int, bool]]:
+    """The bounds that checks of numbers state in words.
+
+    Returns:
+        Of each: the number, on which side of it values are wrong, and whether it is itself right.
+    """
+    found = []
+    for text in (check.text for part in inside(kind) for check in notes(part)):
+        for words, number in re.findall(r"(at least|at most|more than) ([\d,.]*\d)", text):
+            found.append(
+                (float(number.replace(",", "")), 1 if words == "at most" else -1, "at" in words)
+            )
+        if text == "positive and finite":
+            found.append((0.0, -1, False))
+        if text == "between 0 and 1":
+            found += [(0.0, -1, True), (1.0, 1, True)]
+    return found
+
+
+def takes(kind: Any, value: Any) -> bool:
+    """Whether an annotation allows a value. True where it cannot be told."""
+    if is_annotated(kind):
+        try:
+            for check in notes(kind):
+                value = check.convert(value)
+            return takes(get_args(kind)[0], value) and all(c.holds(value) for c in notes(kind))
+        except (TypeError, ValueError, IndexError, OverflowError, DeclarationError):
+            return False
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return any(takes(option, value) for option in inner)
+    if kind in (int, float):
+        number = type(value) in (int, kind)
+        return number and abs(value) < (2**63 if type(value) is int else 3.4e38)
+    if kind in (bool, str, NoneType):
+        return type(value) is kind
+    if origin is Literal:
+        return any(type(value) is type(word) and value == word for word in inner)
+    if origin in (list, tuple, Sequence):
+        same = isinstance(value, list | tuple)
+        several = origin is not tuple or Ellipsis in inner
+        each = [inner[0]] * len(value) if same and several else inner
+        return same and len(each) == len(value) and all(map(takes, each, value))
+    if origin in (dict, Mapping):
+        return isinstance(value, dict) and all(takes(inner[0], k) for k in value)
+    if kind is Any:
+        return True
+    if origin is not None or not isinstance(kind, type) or getattr(kind, "_is_protocol", False):
+        return callable(value) or "Callable" not in str(kind)
+    return isinstance(value, kind) or (is_dataclass(kind) and value == {})
+
+
+def outside(kind: type[Any], name: str) -> list[Any]:
+    """Values that a field does not allow."""
+    hint, found = annotations_of(kind)[name], list(BY_RULE.get((kind, name), ()))
+    beside = [b + side * step for b, side, _ in bounds(hint) for step in (1, 0.5, 1e-9 * (1 + b))]
+    edges = [b for b, _, right in bounds(hint) if not right]
+    numbers = [int(x) if x == int(x) else x for x in (*beside, *edges)]
+    if any(get_origin(part) is tuple for part in inside(hint)):
+        numbers = [(8, x) for x in numbers]
+    return found + [x for x in (*ODD, *numbers) if not takes(hint, x)]
+
+
+def test_every_public_class_of_settings_is_tested():
+    assert len(CHECKED) > 20
+    assert {name for _, name in FIELDS} >= {"gamma", "hidden", "places", "start_calls", "learn"}
+
+
+def test_every_number_has_bounds_but_those_that_may_be_any():
+    for kind, name in FIELDS:
+        hint = annotations_of(kind)[name]
+        if any(part in (int, float) for part in inside(hint)) and not bounds(hint):
+            assert (kind, name) in UNBOUNDED, (kind, name, hint)
 
 
 @pytest.mark.parametrize(("kind", "name"), FIELDS, ids=ids)
-def test_a_wrong_value_is_named_with_its_class_and_field(kind, name):
-    for value in TABLE[kind][name].refused:
+def test_a_value_outside_is_named_with_its_class_and_field(kind, name):
+    for value in outside(kind, name):
         with pytest.raises(DeclarationError) as caught:
             make(kind, name, value)
         said = str(caught.value)
@@ -350,21 +219,67 @@ def test_a_wrong_value_is_named_with_its_class_and_field(kind, name):
 
 
 @pytest.mark.parametrize(("kind", "name"), FIELDS, ids=ids)
-def test_a_right_value_is_kept_as_plain_python(kind, name):
-    for value in TABLE[kind][name].taken:
-        if value is None and BESIDE.get((kind, name)) and name.startswith("v_"):
-            continue  # the other bound needs it
-        found = getattr(make(kind, name, value), name)
-        plain = value.item() if isinstance(value, np.generic) else value
-        if isinstance(value, list | tuple):
-            parts = [x.item() if isinstance(x, np.generic) else x for x in value]
-            assert list(found) == parts
-            assert [type(x) for x in found] == [type(x) for x in parts]
-        elif not isinstance(value, dict) or name in ("ranges", "kwargs", "obs_names"):
-            assert found == plain
-            assert type(found) is type(plain)
+def test_values_at_the_bounds_are_kept_as_plain_python(kind, name):
+    hint = annotations_of(kind)[name]
+    if any(get_origin(part) is tuple for part in inside(hint)):
+        return
+    for number in (b for b, _, right in bounds(hint) if right):
+        whole = int in inside(hint)
+        given = np.int64(number) if whole else np.float64(number)
+        kept = fitted(hint, given, name)
+        assert (kept, type(kept)) == (number, int if whole else float)
+
+
+@pytest.mark.parametrize(("kind", "name"), FIELDS, ids=ids)
+def test_a_default_is_kept_as_plain_python_where_it_is_numpys(kind, name):
+    of = next(f for f in fields(kind) if f.name == name)
+    if of.default is MISSING or (kind, name) in BESIDE:
+        return
+    given = of.default
+    if isinstance(given, bool | int | float | str):
+        given = np.asarray(given)[()]
+    elif isinstance(given, tuple):
+        given = [np.asarray(x)[()] for x in given]
+    kept = getattr(make(kind, name, given), name)
+    assert kept == of.default
+    assert type(kept) is type(of.default)
+    if isinstance(kept, tuple):
+        assert list(map(type, kept)) == list(map(type, of.default))
+
+
+TAKEN: dict[tuple[type[Any], str], tuple[Any, ...]] = {
+    (sw.Network, "sees"): ((0, 1, 4), [0, 1, 4], ("x", 1, "y.z")),
+    (sw.Network, "cnn"): (sw.algorithms.CNN(), {"kind": "impala"}),
+    (sw.Network, "encoder"): ("cells",),
+    (sw.Part, "scale"): (0.5, [0.5, 1.0]),
+    (sw.Part, "places"): ([0, 2], slice(0, 3)),
+    (sw.Part, "clip"): ([-1.0, 1.0],),
+    (sw.PPO, "learning_rate"): (1, sw.algorithms.Linear(1e-3, 0), {"start": 1e-3, "end": 0.0}),
+    (sw.PPO, "compile"): (True, "auto"),
+    (Mutations, "ranges"): ({"gamma": Range(0.5, 0.9)}, {}),
+    (Mutations, "units"): ((1, 2), [np.int64(1), 2]),
+    (Mutations, "activations"): (["relu", "elu"],),
+    (Evolution, "selection"): (Tournament(3),),
+    (sw.Hierarchy, "call_steps"): (sw.Lengths(1, 2), 5),
+    (sw.Hierarchy, "selector"): (sw.PPO(), np.sign),
+    (sw.Hierarchy, "env"): (sw.EnvSpec("CartPole-v1"),),
+    (sw.EnvSpec, "env"): (gym.Env,),
+    (sw.EnvSpec, "kwargs"): ({"x": 1},),
+    (sw.EnvSpec, "wrappers"): ([gym.Wrapper],),
+    (sw.EnvSpec, "pool"): (sw.envs.envpool,),
+    (sw.EnvSpec, "obs_names"): (["x", "y"], {"x": ["y"]}),
+    (sw.TrainDefaults, "log_info"): (["x"], ("x", "y"), []),
+}
+
+
+@pytest.mark.parametrize(("kind", "name"), TAKEN, ids=ids)
+def test_unusual_right_values_are_taken(kind, name):
+    for value in TAKEN[kind, name]:
+        kept = getattr(make(kind, name, value), name)
+        if isinstance(value, dict) and is_dataclass(kept):
+            assert all(getattr(kept, key) == given for key, given in value.items())
         else:
-            assert is_dataclass(found)
+            assert list(kept) == list(value) if isinstance(value, list) else kept == value
 
 
 def test_a_changed_attribute_is_checked_before_training():
@@ -377,15 +292,14 @@ def test_a_changed_attribute_is_checked_before_training():
             made.validate()
 
 
-@pytest.mark.parametrize("kind", [k for k in TABLE if issubclass(k, OnPolicy | OffPolicy)])
+@pytest.mark.parametrize(
+    "kind", [sw.PPO, sw.algorithms.SelfImitationPPO, SkillCritic, sw.DQN, sw.TD3, sw.SAC]
+)
 def test_a_file_is_held_against_the_same_checks(kind):
-    if kind in (OnPolicy, OffPolicy, ActorCritic):
-        return  # none is read from files
     data = config_to_json(kind())
-    for name, field_kind in TABLE[kind].items():
-        for value in field_kind.refused:
-            if isinstance(value, type):
-                continue
+    for name in (name for k, name in FIELDS if k is kind):
+        values = [x for x in outside(kind, name) if not isinstance(x, type)]
+        for value in random.Random(name).sample(values, 5):
             with pytest.raises(RunError) as caught:
                 config_from_json(data | {name: value}, "run.json", "stages[0].algorithm")
             said = str(caught.value)
@@ -393,22 +307,21 @@ def test_a_file_is_held_against_the_same_checks(kind):
             assert f"stages[0].algorithm.{name}" in said, value
 
 
-SKILL = {
-    "max_steps": or_none(AT_LEAST_ONE), "call_steps": or_none(AT_LEAST_ONE),
-    "steps": or_none(AT_LEAST_ONE), "task_weight": or_none(NON_NEGATIVE),
-    "target_return": or_none(ANY), "target_success": or_none(SHARE),
-    "algorithm": or_none(ALGORITHM),
-}  # fmt: skip
-"""What the class attributes of a skill must be."""
+OF_SKILLS = (
+    *("max_steps", "call_steps", "steps", "task_weight", "target_return", "target_success"),
+    "algorithm",
+)
 
 
-@pytest.mark.parametrize("name", SKILL)
+@pytest.mark.parametrize("name", OF_SKILLS)
 def test_a_skills_wrong_attribute_is_named_with_the_skill(name):
-    for value in SKILL[name].refused:
+    for value in outside(sw.Skill, name):
         odd = type("Odd", (sw.Skill,), {name: value})()
         with pytest.raises(DeclarationError, match=rf"^skill 'odd'.*: {name} is "):
             sw.Hierarchy("CartPole-v1", [odd])
-    for value in SKILL[name].taken:
+    for value in (sw.PPO(), None) if name == "algorithm" else (np.float64(1), np.int64(1), None):
+        if name.endswith("steps") and isinstance(value, float):
+            continue
         right = type("Right", (Stay,), {name: value, "success": Stay.termination})()
         sw.Hierarchy("CartPole-v1", [right])
         plain = value.item() if isinstance(value, np.generic) else value

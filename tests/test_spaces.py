@@ -1,6 +1,5 @@
 import json
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -360,8 +359,3 @@ PIXELS = Box(0, 255, (8, 8, 3), np.uint8)
 )
 def test_spaces_are_the_same_if_a_policy_of_one_can_act_in_the_other(one, other, same):
     assert same_space(one, other) == same
-
-
-def test_a_space_that_holds_no_number_is_refused():
-    with pytest.raises(EnvError, match=r"the observation space Box.* holds no number"):
-        obs_codec(gym.spaces.Box(0.0, 1.0, (0,), np.float32))

@@ -15,7 +15,6 @@ from skillweave.algorithms import ppo
 from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.parameters import epsilon_now
 from skillweave.algorithms.ppo import RehearsalRows, Terms
-from skillweave.errors import DeclarationError
 from skillweave.networks.heads import ActionHead
 from skillweave.ops.distributions import with_epsilon
 from skillweave.spaces import action_codec
@@ -56,11 +55,6 @@ def test_who_acts_has_the_floor_and_who_is_greedy_has_not():
     assert head.softmax(-1).min() >= 0.2 - 1e-6
     greedy = algorithm.acting_params_of(algorithm.weights(state))
     assert "epsilon" not in greedy.extra
-
-
-def test_a_floor_needs_discrete_actions():
-    with pytest.raises(DeclarationError, match="epsilon needs discrete actions"):
-        make_algorithm(PPO(epsilon=0.1), SEEN, SEEN)
 
 
 def test_divergence_of_heads_is_that_of_their_distributions():

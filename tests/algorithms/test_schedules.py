@@ -94,13 +94,6 @@ def test_what_is_no_schedule_is_a_sentence(kind):
             Linear(*values)
 
 
-def test_a_schedule_leaves_no_place_for_another_one():
-    with pytest.raises(
-        DeclarationError, match="learning_rate_schedule is 'kl', which adapts a num"
-    ):
-        PPO(learning_rate=Linear(1e-3, 0), learning_rate_schedule="kl", target_kl=0.01)
-
-
 RATES = {"now": 1e-3}
 
 

@@ -89,9 +89,6 @@ def test_the_workers_of_environments_print_there_too(here: Path) -> None:
     [
         pytest.param(TRAIN, "error", 1, "no reward", marks=pytest.mark.slow),
         (TRAIN, "exit", 130, ""),
-        (["info", "a" * 300, "--json"], "", 1, "File name too long"),
-        (["train", "talks.py", "--sed", "3", "--json"], "", 2, "arguments are wrong"),
-        (["train", "talks.py", "--steps", "3", "--json"], "", 2, "--set steps=N"),
         (["trian", "talks.py", "--json"], "", 2, "is 'train' meant?"),
     ],
 )
@@ -102,6 +99,27 @@ def test_an_error_is_one_object_too(
     assert done.returncode == code, done.stderr
     assert says in json.loads(done.stdout)["error"]
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (["info", "a" * 300], 1, "File name too long"),
+        (["train", "talks.py", "--sed", "3"], 2, "arguments are wrong"),
+        (["train", "talks.py", "--steps", "3"], 2, "--set steps=N"),
+    ],
+)
+def test_an_error_is_one_object_in_this_process_too(
+    here: Path, capfd: pytest.CaptureFixture[str], words: list[str], code: int, says: str
+) -> None:
+    try:
+        ended = main([*words, "--json"])
+    except SystemExit as error:
+        ended = error.code
+    assert ended == code
+    out, err = capfd.readouterr()
+    assert says in json.loads(out)["error"]
+    assert "Traceback" not in err
 
 
 def test_an_error_that_nobody_expected_is_one_object_and_a_traceback(here: Path) -> None:

@@ -239,11 +239,6 @@ def test_making_an_engine_is_silent(engine, name):
         engine(name).reset(0)
 
 
-def test_envpool_refuses_what_it_cannot_run():
-    with pytest.raises(EnvError, match=r"EnvPool cannot run Ledger.*engine='auto'"):
-        make_engine(EnvSpec(Ledger, engine="envpool"), 2)
-
-
 def test_a_missing_dependency_names_the_extra(monkeypatch):
     def absent(*_, **__):
         raise gym.error.DependencyNotInstalled("Box2D is not installed")

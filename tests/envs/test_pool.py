@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 import skillweave as sw
 from skillweave.envs import PoolWrapper, one_of
 from skillweave.envs.make import make_engine, workers_for
-from skillweave.errors import DeclarationError, EnvError, MissingExtra
+from skillweave.errors import EnvError, MissingExtra
 
 N = 5
 
@@ -233,11 +233,6 @@ def test_one_environment_of_a_pool_has_the_pools_name_and_starts_anywhere_withou
     assert sw.EnvSpec(one_of(Clock), pool=Clock).name == "Clock"
     starts = {int(one_of(later)().reset()[0]["root"]) for _ in range(8)}
     assert len(starts) > 1
-
-
-def test_one_of_takes_a_function():
-    with pytest.raises(DeclarationError, match=r"one_of\(\) got 'CartPole-v1'; it takes the func"):
-        one_of("CartPole-v1")
 
 
 def test_a_pool_with_other_parts_is_told():

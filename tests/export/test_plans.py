@@ -226,7 +226,7 @@ def acted_in(env: Any, policy: Any, actor: Any, seed: int) -> list[Any]:
     ]
 
 
-@pytest.mark.fast_cases(3)
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("case", GOING)
 def test_the_runner_chooses_the_goals_of_a_plan(case: str, tmp_path: Path) -> None:
     space, how = GOING[case]
@@ -250,6 +250,7 @@ def test_the_runner_chooses_the_goals_of_a_plan(case: str, tmp_path: Path) -> No
 WORLDS = (Point, Fenced)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("how", [{"more": True}, {"call_steps": Lengths(2, 5)}])
 def test_a_plan_with_goals_that_guides_is_exported(how: Any, tmp_path: Path) -> None:
     """A guide says which skill and length, and the selector beside it which goal."""

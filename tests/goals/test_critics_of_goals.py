@@ -15,12 +15,10 @@ import skillweave as sw
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.config import SkillCritic
-from skillweave.policies.core import INTERRUPTED, RUNNING, RowPolicy
-from skillweave.policies.hierarchy import CallAndReturn, CalledSkill, Interruption
+from skillweave.policies.core import RowPolicy
+from skillweave.policies.hierarchy import CallAndReturn, CalledSkill
 from skillweave.skills.goal_spaces import draw_from, with_goal
 from skillweave.skills.goals import goals_of
-from skillweave.skills.skill_set import SkillSet
-from skillweave.types import Step
 
 TOGETHER = {"selector": SELECTOR, "learn": "together", "train_defaults": OFTEN}
 
@@ -56,40 +54,6 @@ def test_what_a_skill_is_worth_depends_on_its_goal_and_a_decision_does_not(space
     assert worth.shape == (20, 3)
     assert len(np.unique(worth[:, 0].round(4))) > 1
     np.testing.assert_allclose(worth[:, 2], worth[0, 2], rtol=1e-5)
-
-
-def test_goals_of_skills_that_do_not_run_are_not_seen():
-    goals = {i: goals_of(go_to("box", name=f"go{i}")) for i in range(2)}
-    obs, running = np.zeros((2, 2), np.float32), np.array([0, 1])
-    mine = {i: np.full((2, 2), i + 0.5, np.float32) for i in range(2)}
-    seen = of_skills(goals).beside_calls(obs, running, mine)["goal"]
-    assert seen["go0"].tolist() == [[0.5, 0.5], [0, 0]]
-    assert seen["go1"].tolist() == [[0, 0], [1.5, 1.5]]
-
-
-def test_a_call_is_cut_for_its_goal():
-    """Two environments run the same skill: the one whose goal is worth little decides again."""
-
-    def worth(seen):
-        far = seen["goal"]["go_to"][:, 0]
-        return np.stack([far, far * 0, far * 0], axis=1)
-
-    skill = go_to()
-    space = with_goal(Point.observation_space, skill.goal_space)
-    policy = sw.from_function(lambda obs, goal: goal - obs).bind_with_goals(
-        Point.observation_space, Point.action_space, "it", goals_of(skill)
-    )
-    assert policy.observation_space == space
-    skills = SkillSet((skill,), (policy,), interruption=Interruption(worth, 0.2))
-    policy = skills.hierarchy
-    memory, rows = policy.start(3), np.arange(3)
-    goals = np.float32([[-0.9, 0], [-0.1, 0], [0.9, 0]])  # 0 is worth 0.9, 0.1 and -0.9 more
-    policy.begin(memory, rows, np.zeros(3, int), {0: goals})
-    obs = np.zeros((3, 2), np.float32)
-    no = np.zeros(3, bool)
-    step = Step(obs, obs, obs + 2, np.zeros(3), no, no, no, np.ones(3, int), {})
-    policy.observe(memory, rows, step)
-    assert memory["end"].tolist() == [INTERRUPTED, RUNNING, RUNNING]
 
 
 @pytest.mark.fast_cases(1)

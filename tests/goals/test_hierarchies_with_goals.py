@@ -24,12 +24,6 @@ class Walk(GoTo):
         return np.clip(5 * (aim_of(goal) - obs), -1, 1)
 
 
-def passes_on(obs):
-    """The inner selector: the goal of the hierarchy is that of its skill."""
-    assert obs["goal"].shape == (len(obs), 2)
-    return np.full(len(obs), "walk"), np.clip(obs["goal"], -1, 1)
-
-
 def outer_goals(obs):
     return np.full(len(obs), "far"), np.where(obs[:, :1] > 0, 0.7, 0.1) * np.ones((1, 2))
 
@@ -38,22 +32,6 @@ def far(inner, space: str = "box", **attributes) -> sw.Skill:
     """A hierarchy as a skill with goals."""
     methods = {"name": "far", "policy": inner, "goal_space": SPACES[space], "max_steps": 9}
     return type("Far", (GoTo,), methods | attributes)()
-
-
-def test_a_rule_passes_the_goal_on():
-    inner = declared([Walk(), Rest()], selector=passes_on, name="inner", call_steps=3)
-    hierarchy = declared([far(inner), Rest()], selector=outer_goals, call_steps=9)
-    run = hierarchy.train(quiet=True)
-    report = run.evaluate(4)
-    assert report.skills["far"].success_rate == 1.0
-    assert report.skills["far/walk"].calls >= report.skills["far"].calls
-    alone = run.evaluate(6, skill="far")
-    assert alone.skills["far"].success_rate > 0.3  # drawn goals, some of them far
-    player = run.player(skill="far", goal=(0.5, 0.7))
-    obs = np.zeros(2, np.float32)
-    for _ in range(9):
-        obs = obs + 0.2 * player.act(obs)
-    np.testing.assert_allclose(obs, [0.5, 0.7], atol=0.15)
 
 
 @pytest.mark.fast_cases(2)

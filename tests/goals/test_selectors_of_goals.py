@@ -7,11 +7,10 @@ from small_runs import goes_on
 from worlds import OFF, OFTEN, ON, SELECTOR, SMALL, SPACES, Point, Rest, declared, go_to
 
 import skillweave as sw
-from skillweave.errors import DeclarationError, PolicyError, SkillError
+from skillweave.errors import PolicyError, SkillError
 
 HERE = (0.5, -0.5)
 BYTES = gym.spaces.Box(0, 255, (2,), np.uint8)
-BITS = gym.spaces.MultiBinary(2)
 NESTED = gym.spaces.Dict({"at": gym.spaces.Box(-1, 1, (2,), np.float32), "byte": BYTES})
 
 
@@ -37,43 +36,21 @@ READY = {
 
 
 @pytest.mark.parametrize("name", READY)
-@pytest.mark.parametrize("learn", ["apart", "together"])
-def test_ready_selectors_give_goals(name, learn):
-    skills = [go_to(), Rest()]
-    run = declared(skills, selector=READY[name], learn=learn).train(quiet=True)
+def test_ready_selectors_give_goals(name):
+    def hierarchy():
+        learn = "together" if name == "tree" else "apart"
+        return declared([go_to(), Rest()], selector=READY[name], learn=learn)
+
+    run = hierarchy().train(quiet=True)
     report = run.evaluate(4)
     assert report.skills["go_to"].calls > 0
-    again = declared([go_to(), Rest()], selector=READY[name], learn=learn)
-    assert sw.load(run.path, again).evaluate(4).returns == report.returns
-
-
-def test_goals_are_those_that_the_selector_gave():
-    seen = []
-
-    class Looks(Rest):
-        name = "go_to"
-        goal_space = SPACES["box"]
-
-        def policy(self, obs, goal):
-            seen.append(np.array(goal))
-            return np.zeros((len(obs), 2), np.float32)
-
-    hierarchy = declared([Looks()], selector=lambda obs: (np.full(len(obs), "go_to"), obs / 4))
-    run = hierarchy.train(quiet=True)
-    seen.clear()
-    env = Point()
-    obs, _ = env.reset(seed=1)
-    player, first = run.player(), obs
-    for _ in range(7):  # the point stays where it is; calls last 3 steps
-        player.act(obs)
-        obs, *_ = env.step(np.zeros(2))
-    assert np.allclose(np.concatenate(seen), first / 4)
+    assert sw.load(run.path, hierarchy()).evaluate(4).returns == report.returns
 
 
 SPACE_NAMES = [name for name in SPACES if name != "picture"]
 
 
-@pytest.mark.fast_cases(2 * len(SPACE_NAMES))
+@pytest.mark.fast_cases(len(SPACE_NAMES))
 @pytest.mark.parametrize("space", SPACE_NAMES)
 @pytest.mark.parametrize("learn", ["apart", "together", "apart, then together"])
 def test_a_selector_learns_skill_and_goal(space, learn):
@@ -85,7 +62,7 @@ def test_a_selector_learns_skill_and_goal(space, learn):
     run.evaluate(3, deterministic=False)
 
 
-@pytest.mark.fast_cases(4)
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("learn", ["apart", "together"])
 @pytest.mark.parametrize("space", ["box", "number", "numbers"])
 def test_an_interrupted_run_ends_with_the_same_weights(learn, space, tmp_path):
@@ -97,7 +74,8 @@ def test_an_interrupted_run_ends_with_the_same_weights(learn, space, tmp_path):
     goes_on(hierarchy, tmp_path)
 
 
-@pytest.mark.parametrize("learn", ["apart", "together"])
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("learn", ["together", "apart"])
 def test_skills_with_goals_inside(learn, tmp_path):
     def hierarchy():
         how = {"selector": SELECTOR, "learn": learn, "train_defaults": OFTEN}
@@ -116,7 +94,7 @@ def test_chosen_lengths_and_goals():
     run.evaluate(3, deterministic=False)
 
 
-@pytest.mark.fast_cases(6)
+@pytest.mark.fast_cases(3)
 @pytest.mark.parametrize(
     "selector",
     [
@@ -134,45 +112,11 @@ def test_a_selector_with_values_chooses_discrete_goals(selector, space, tmp_path
 
     def hierarchy(learn="apart"):
         skills = [Sometimes(), go_to(space)]
-        return declared(skills, selector=selector, learn=learn, steps=900, train_defaults=OFTEN)
+        return declared(skills, selector=selector, learn=learn, steps=600, train_defaults=OFTEN)
 
     whole = goes_on(hierarchy, tmp_path, 4)
     assert sw.load(whole.path, hierarchy()).evaluate(3).returns == whole.evaluate(3).returns
     hierarchy("together").train(seed=3, quiet=True)
-
-
-@pytest.mark.parametrize(
-    ("selector", "space", "says"),
-    [
-        (sw.DQN(), "box", r"selector: DQN cannot choose goals of Box.*'go_to' needs them"),
-        (sw.TD3(), "number", "selector: TD3 cannot choose goals, but"),
-        (sw.PPO(), "picture", "selector: PPO cannot choose goals of Box"),
-    ],
-)
-def test_algorithms_say_which_goals_they_cannot_choose(selector, space, says):
-    with pytest.raises(DeclarationError, match=says):
-        declared([go_to(space)], algorithm=ON, selector=selector).check_spaces()
-
-
-@pytest.mark.parametrize(
-    ("selector", "says"),
-    [
-        (
-            lambda obs: np.full(len(obs), "go_to"),
-            r"chose skill 'go_to' without a goal .*return \(names, goals\)",
-        ),
-        (lambda obs: (np.full(len(obs), "go_to"), obs[0]), "gave goals of shape"),
-        (lambda obs: (np.full(len(obs), "go_to"), obs + 9), "which is out of goal_space Box"),
-        (lambda obs: (np.full(len(obs), "rest"), {"rest": obs}), "which has no goals"),
-        (sw.Automaton({"a": "go_to"}, {}), r"without a goal .*write \('go_to', goal\)"),
-        (sw.tree.Sequence(("go_to", (1.0, 2.0, 3.0))), "gave goals of shape"),
-        (sw.Automaton({"a": ("go_to", (0.5, (0.5, 1)))}, {}), "which are no goals of Box"),
-        (sw.Automaton({"a": ("go_to", lambda obs: None)}, {}), "returned None, but goals"),
-    ],
-)
-def test_a_goal_that_is_not_right(selector, says):
-    with pytest.raises(SkillError, match=says):
-        evaluated(selector, SPACES["box"])
 
 
 def test_goals_for_skills_without_goals():
@@ -184,46 +128,6 @@ def test_goals_for_skills_without_goals():
         declared([go_to(policy=agent.policy)]).check_spaces()
 
 
-def test_a_goal_out_of_reach_is_clipped():
-    def nearest(self, obs, goal):
-        return np.clip(goal, -0.3, 0.3)
-
-    skill = go_to(clip_goal=nearest)
-    rule = lambda obs: (np.full(len(obs), "go_to"), np.full((len(obs), 2), 5.0))  # noqa: E731
-    run = declared([skill], selector=rule).train(quiet=True)
-    player = run.player()
-    player.act(np.zeros(2, np.float32))
-    assert np.allclose(player.memory["goal"]["0"], 0.3)
-
-
-def test_an_environment_of_options_takes_goals():
-    env = sw.envs.make_options_env(declared([Rest(), go_to()]).train(quiet=True), 3, 0.9)
-    env.reset(seed=0)
-    env.action_space.seed(0)
-    for _ in range(5):
-        obs, *_ = env.step(env.action_space.sample())
-    assert obs.shape == (3, 2)
-
-
-@pytest.mark.parametrize(
-    ("actions", "says"),
-    [
-        ([0, 1], "but skills have goals: give a dict with 'skill'.* goals for 'go_to'"),
-        ({"skill": [0], "goal": {"go_to": np.zeros((2, 2))}}, r"the skills are \[0\]; .* 2 env"),
-        ({"skill": [0, 2], "goal": {"go_to": np.zeros((2, 2))}}, "action 2 is no skill"),
-        (
-            {"skill": [0, 0], "goal": {"go_to": np.zeros((2, 3))}},
-            r"shape \(2, 3\) for skill 'go_to'",
-        ),
-    ],
-)
-def test_an_environment_of_options_says_what_is_wrong(actions, says):
-    env = sw.envs.make_options_env(declared([go_to(), Rest()]).train(quiet=True), 2, 0.9)
-    env.reset(seed=0)
-    with pytest.raises(sw.SkillweaveError, match=says):
-        env.step(actions)
-
-
 def test_an_environment_of_options_does_not_change_goals():
     skill = go_to()
     type(skill).goal_space = BYTES
@@ -232,22 +136,6 @@ def test_an_environment_of_options_does_not_change_goals():
     env.reset(seed=0)
     with pytest.raises(SkillError, match=r"gave the goal \[300, 1\], which is out of goal_space"):
         env.step({"skill": np.zeros(2, int), "goal": {"go_to": np.array([[1, 1], [300, 1]])}})
-
-
-def test_what_goals_are_not_for_yet():
-    guide = sw.Guide(sw.Automaton({"a": {("go_to", HERE), "rest"}}, {}))
-    with pytest.raises(DeclarationError, match="guide: it gives a goal"):
-        declared([go_to(), Rest()], selector=SELECTOR, guide=guide).check_spaces()
-
-
-def test_spaces_of_goals():
-    with pytest.raises(DeclarationError, match="goal_space is 3; it must be a Gymnasium space"):
-        declared([type("GoTo", (sw.Skill,), {"goal_space": 3})()])
-    with pytest.raises(DeclarationError, match=r"has clip_goal.., but no goals: set goal_space"):
-        declared([type("GoTo", (sw.Skill,), {"clip_goal": lambda self, obs, goal: goal})()])
-    graph = gym.spaces.Graph(gym.spaces.Discrete(2), None)
-    with pytest.raises(DeclarationError, match=r"goal_space Graph.* is not supported"):
-        declared([type("GoTo", (sw.Skill,), {"goal_space": graph})()]).check_spaces()
 
 
 def skill_of(space):
@@ -266,37 +154,6 @@ def evaluated(selector, space):
     return hierarchy.train(quiet=True).evaluate(2)
 
 
-@pytest.mark.parametrize(
-    ("goal", "space"),
-    [((300, 300), BYTES), ((-1, 7), BYTES), ((257, 0), BITS), ((3, 2**40), SPACES["numbers"])],
-)
-@pytest.mark.parametrize("form", ["function", "automaton", "tree", "by function"])
-def test_whole_goals_do_not_wrap_around(goal, space, form):
-    selector = {
-        "function": lambda obs: (["go_to"] * len(obs), np.tile(goal, (len(obs), 1))),
-        "automaton": sw.Automaton({"a": ("go_to", goal)}, {}),
-        "tree": sw.tree.Sequence(("go_to", goal)),
-        "by function": sw.tree.Sequence(("go_to", lambda obs: np.tile(goal, (len(obs), 1)))),
-    }[form]
-    says = rf"gave the goal \[{goal[0]}, {goal[1]}\], which is out of goal_space .*skill 'go_to'"
-    with pytest.raises(SkillError, match=says):
-        evaluated(selector, space)
-
-
-@pytest.mark.parametrize(
-    ("byte", "says"),
-    [
-        ((300, 1), r"gave the goal \[300, 1\], .* of the part 'byte' of skill 'go_to'"),
-        ((1.5, 1.0), "gave goals of float64 for the part 'byte' of .* are whole numbers"),
-        ((1, 2, 3), "gave goals of shape"),
-    ],
-)
-def test_parts_of_goals_do_not_change(byte, says):
-    selector = sw.tree.Sequence(("go_to", {"at": (0.5, 0.5), "byte": byte}))
-    with pytest.raises(SkillError, match=says):
-        evaluated(selector, NESTED)
-
-
 def test_goals_of_other_rows_may_be_anything():
     def rule(obs):
         goes = obs[:, 0] > 0
@@ -304,13 +161,6 @@ def test_goals_of_other_rows_may_be_anything():
         return np.where(goes, "go_to", "rest"), goals
 
     assert len(evaluated(rule, BYTES).returns) == 2
-
-
-def test_goals_of_unequal_shapes():
-    """Fixed goals are checked before training: those of all states, whichever come to pass."""
-    selector = sw.Automaton({"a": ("go_to", HERE), "b": ("go_to", (1.0, 2.0, 3.0))}, {})
-    with pytest.raises(SkillError, match=r"gave goals of shape \(1, 3\) for skill 'go_to'"):
-        declared([go_to(), Rest()], selector=selector).check_spaces()
 
 
 AT = {"at": (0.5, -0.5), "byte": (1, 2)}
@@ -337,24 +187,6 @@ def test_a_function_gives_goals_of_several_parts(goals, space, wanted):
     player.act(np.ones(2, np.float32))
     goal = run.policy.goal_now(player.memory)
     assert all(np.allclose(goal[name], part) for name, part in wanted.items())
-
-
-@pytest.mark.parametrize(
-    "rule",
-    [
-        lambda obs: ("go_to", HERE),
-        lambda obs: [("go_to", HERE) for _ in obs],
-        lambda obs: (["go_to"] * len(obs), None),
-        lambda obs: (["go_to"] * len(obs), obs / 4, 1),
-    ],
-)
-def test_another_form_of_skills_and_goals(rule):
-    with pytest.raises(SkillError, match=r"return \(names, goals\), one of each per environment"):
-        evaluated(rule, SPACES["box"])
-    with pytest.raises(
-        SkillError, match=r"no skill that it selects has goals|names 'go_to'|no arr"
-    ):
-        declared([Rest()], selector=rule).check_spaces()
 
 
 @pytest.mark.parametrize("names", [("rest", "rest"), (1, 1), (np.str_("rest"), np.str_("rest"))])

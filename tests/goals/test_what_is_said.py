@@ -52,25 +52,6 @@ def test_a_space_that_is_not_supported_is_named_with_its_skill(space, says, lear
         declared([skill]).train(quiet=True)
 
 
-@pytest.mark.parametrize(
-    ("space", "goals", "says"),
-    [
-        (
-            "dict",
-            {"at": 0, "side": 1, "sid": 0},
-            r"gave goals of the parts \['at', 'side', 'sid'\] for",
-        ),
-        ("tuple", (0, 1, 2), "a tuple of 2 parts was expected"),
-    ],
-)
-def test_goals_without_the_right_parts_are_named_with_their_skill(space, goals, says):
-    def choose(obs):
-        return np.full(len(obs), "go_to"), goals
-
-    with pytest.raises(SkillError, match=says):
-        declared([go_to(space)], selector=choose).train(quiet=True)
-
-
 def test_a_reward_that_ignores_the_goal_is_said(capsys):
     class Blind(sw.Skill):
         name = "go_to"
@@ -291,19 +272,6 @@ def test_functions_get_the_goal_where_a_parameter_takes_it(name):
     assert np.allclose(player.act(ZERO), (0.5, -0.5))
 
 
-@pytest.mark.parametrize(
-    ("policy", "kind", "says"),
-    [
-        (lambda self, obs: constant(obs), PolicyError, r"takes no goal.*policy\(obs, goal\)"),
-        (lambda obs, scale=2.0: constant(obs), PolicyError, "takes no goal"),
-        (lambda s, o: constant(o), DeclarationError, r"takes \(s, o\), which may be"),
-    ],
-)
-def test_functions_that_cannot_take_the_goal_are_refused(policy, kind, says):
-    with pytest.raises(kind, match=says):
-        declared([go_to(policy=policy)]).check_spaces()
-
-
 def test_weights_of_another_goal_space_are_refused(tmp_path):
     run = declared().train(tmp_path / "run", quiet=True)
     says = r"was trained for goals of Box\(-1.0, 1.0.* now its goal_space is Box\(-2.0, 2.0"
@@ -336,21 +304,6 @@ def test_a_selector_of_other_goals_is_refused():
         other.train(run.path, resume=True, quiet=True)
     with pytest.raises(RunError, match=r"'selector' cannot start .*: its actions are others here"):
         other.train(start_from=run.path, quiet=True)
-
-
-def test_a_network_that_leaves_out_the_goal_is_refused():
-    for sees in ((0, 1), "observation"):
-        blind = sw.PPO(network=sw.Network((8,), sees=sees))
-        with pytest.raises(DeclarationError, match=r"network.sees leaves out the goal.*'goal'"):
-            declared(algorithm=blind).check_spaces()
-    declared(algorithm=sw.PPO(network=sw.Network((8,), sees=(0, "goal")))).check_spaces()
-
-
-def test_a_network_that_sees_what_is_not_there_is_named_with_its_skill():
-    wrong = sw.PPO(network=sw.Network((8,), sees=("observatoin", "goal")))
-    words = "skill 'go_to': Network.sees names 'observatoin', .* is 'observation' meant"
-    with pytest.raises(DeclarationError, match=words):
-        declared(algorithm=wrong).check_spaces()
 
 
 @pytest.mark.parametrize("name", SPACES)

@@ -9,7 +9,6 @@ from skillweave import PPO, Network
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import register_encoder
 from skillweave.algorithms.agent_policy import make_algorithm
-from skillweave.errors import DeclarationError
 from skillweave.networks.encoders import (
     CELL_FEATURES,
     CELL_KINDS,
@@ -161,11 +160,6 @@ def test_numbers_beside_the_grid_are_features_too():
     )
     assert algorithm.actor_net.encoders["actor.encoder"].size == CELL_FEATURES + 4
     assert algorithm.init([Seeds(0), Seeds(1)]).params.isfinite().all()
-
-
-def test_observations_without_a_grid_are_refused():
-    with pytest.raises(DeclarationError, match="reads images of whole numbers"):
-        CellsEncoder(obs_codec(gym.spaces.Box(-1, 1, (3,), np.float32)))
 
 
 def test_an_encoder_of_the_same_name_comes_first(monkeypatch):

@@ -8,12 +8,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from crane import SMALL, Arm, Crane, Hook, acted, crane, goes_on_and_loads, greedy
+from crane import SMALL, Arm, Crane, acted, crane, goes_on_and_loads, greedy
 from small_runs import reports_every
 from torch import nn
 
 import skillweave as sw
-from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.errors import DeclarationError
 from skillweave.evolution import Evolution
 
@@ -64,7 +63,7 @@ def bases() -> dict[str, Any]:
     }
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", bases())
 @pytest.mark.parametrize("how", ["together", "apart", "SAC"])
 def test_a_stopped_run_ends_with_the_same_weights(name, how, tmp_path):
@@ -77,29 +76,6 @@ def test_a_stopped_run_ends_with_the_same_weights(name, how, tmp_path):
         return crane(skills, train_defaults=OFTEN, **settings)
 
     goes_on_and_loads(hierarchy, tmp_path)
-
-
-@pytest.mark.fast_cases(2)
-@pytest.mark.parametrize("name", bases())
-def test_the_correction_is_added_to_the_ready_policy(name):
-    ready = bases()[name]
-    skill = declared(copy.deepcopy(ready), scale=(0.5, 0.25, 0.1))
-    run = greedy([skill])
-    learnt = run.policy.skills.policies[0]
-    assert isinstance(learnt, AgentPolicy)
-    base = ready if hasattr(ready, "bind") else sw.from_function(ready)
-    base = base.bind(Crane.observation_space, Crane().action_space, "base")
-    env, player = Crane(), run.player()
-    obs, _ = env.reset(seed=0)
-    memory = base.start(1)
-    for step in range(12):
-        seen = player._seen(obs)
-        ready_action, memory = base.act(memory, seen)
-        more, _ = learnt.act({}, seen)
-        wanted = np.clip(ready_action + [0.5, 0.25, 0.1] * more, -1, 1)
-        action = player.act(obs)
-        assert np.allclose(action, wanted[0], atol=1e-6), step
-        obs, *_ = env.step(action)
 
 
 def test_training_starts_at_the_ready_policy():
@@ -116,23 +92,6 @@ def test_the_skill_alone_acts_as_in_the_hierarchy():
     alone = run._policy("better")
     assert (acted(sw.Player(alone)) == acted(run.player())).all()
     assert run.evaluate(2, skill="better").skills["better"].calls == 2
-
-
-def test_a_call_after_another_skill_starts_the_ready_policy_afresh():
-    def turns(obs: Any) -> Any:
-        return np.where(obs["camera"][:, 0, 0, 0] // 4 % 2 == 0, "better", "still")
-
-    class Still(sw.Skill):
-        """Does nothing."""
-
-        def policy(self, obs):
-            return np.zeros((len(obs), 3), np.float32)
-
-    better = declared(sw.from_function(counted, every=3), scale=1e-9)
-    run = greedy([better, Still()], selector=turns)
-    actions = acted(run.player())[:, 0]
-    assert np.allclose(actions[:4], [0, 0, 0, 0.3], atol=1e-6)
-    assert np.allclose(actions[8:12], [0.8, 0.8, 0.8, 1.0], atol=1e-6)
 
 
 @pytest.mark.slow
@@ -160,19 +119,6 @@ def test_another_correction_is_not_loaded(policy, says, tmp_path):
     run = crane([declared(middle)]).train(tmp_path / "run", quiet=True)
     with pytest.raises(sw.SkillweaveError, match=says):
         crane([type("Better", (Better,), {"policy": policy})()]).load(run.path)
-
-
-def test_a_correction_of_a_part():
-    def hold(arm: Any) -> Any:
-        return -0.5 * arm
-
-    skill = type("Arm", (Arm,), {"policy": sw.Residual(hold, 0.2)})()
-    run = crane([skill, Hook()], selector=lambda obs: np.full(len(obs), "arm")).train(quiet=True)
-    actions = acted(run.player())
-    assert (actions[:, 2] == 0).all()
-    env = Crane()
-    obs, _ = env.reset(seed=0)
-    assert np.abs(actions[0, :2] - np.clip(-0.5 * obs["arm"], -1, 1)).max() <= 0.2
 
 
 @pytest.mark.slow
@@ -204,66 +150,6 @@ def test_a_population_learns_corrections():
     evolve = {"better": Evolution(population=2, generations=2)}
     run = crane([Better()], learn="apart", steps=1200).train(evolve=evolve, quiet=True)
     assert run.evaluate(2).returns
-
-
-@pytest.mark.parametrize(
-    ("policy", "scale", "says"),
-    [
-        (None, 0.2, "Residual.policy is None; it must be a function of observations"),
-        (middle, 0.0, "Residual.scale is 0.0; it must be a number over 0"),
-        (middle, (0.1, -0.2), "Residual.scale is"),
-        (sw.Residual(middle), 0.2, "Residual.policy is Residual"),
-    ],
-)
-def test_what_is_no_correction(policy, scale, says):
-    with pytest.raises(DeclarationError, match=says):
-        sw.Residual(policy, scale)
-
-
-class Ready(sw.Skill):
-    def policy(self, obs):
-        return middle(obs)
-
-
-READY = r"and no policy: give what acts in that skill, {}\.policy"
-LEARNS = r"a skill that learns, and no policy: train .* run\.policy"
-
-
-@pytest.mark.parametrize(
-    ("skill", "says"),
-    [
-        (Ready, "is the class Ready, " + READY.format(r"Ready\(\)")),
-        (Ready(), "is the skill 'ready', " + READY.format("skill")),
-        (Arm, "is the class Arm, " + LEARNS),
-        (Arm(), "is the skill 'arm', " + LEARNS),
-    ],
-)
-def test_a_skill_is_no_policy(skill, says):
-    with pytest.raises(DeclarationError, match=rf"^Residual\.policy {says}$"):
-        sw.Residual(skill)
-    as_policy = type("Better", (sw.Skill,), {"policy": skill})
-    with pytest.raises(DeclarationError, match=rf"skill 'better': policy {says}$"):
-        crane([as_policy()]).train(quiet=True)
-
-
-def test_what_learns_on_is_not_corrected():
-    module = sw.from_torch(nn.Sequential(nn.Linear(3, 3)), learn=True)
-    with pytest.raises(DeclarationError, match=r"with learn=True.*leave out learn"):
-        sw.Residual(module)
-
-
-@pytest.mark.parametrize(
-    ("skill", "env", "says"),
-    [
-        (declared(lambda obs: np.zeros(len(obs), int)), "one", "needs a Box.*Discrete"),
-        (declared(middle, (0.1, 0.2)), "box", "scale has 2 numbers, but the action has 3"),
-        (declared(5), "box", "skill 'better': policy is 5, which cannot act"),
-    ],
-)
-def test_what_does_not_fit_is_refused_before_training(skill, env, says):
-    world = sw.EnvSpec(lambda: Crane(env), engine="sync", workers=1)
-    with pytest.raises(DeclarationError, match=says):
-        crane([skill], env=world).train(quiet=True)
 
 
 def test_what_has_a_policy_is_not_one():

@@ -22,6 +22,7 @@ from skillweave.planning import (
 from skillweave.planning.forecast import forecast
 from skillweave.planning.lacking import asks_nothing
 
+pytestmark = pytest.mark.usefixtures("usual_forecasts")
 A, B = 0, 1
 NINE, NOT_NINE = at(9), ~at(9)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ready_selectors.chain import Corridor, bound, got_key, hierarchy, story
+from ready_selectors.chain import bound, got_key, hierarchy, story
 
 from skillweave import Automaton
 from skillweave.errors import DeclarationError, SkillError
@@ -34,13 +34,6 @@ def test_greedy_the_first_is_called_and_else_one_at_random():
     assert (np.abs(counts[[0, 2, 3]] - 333) < 60).all()  # four standard deviations
     assert set(skill[1::3]) == {2, 3}
     assert set(skill[2::3]) == {2}
-
-
-def test_it_solves_a_chain_of_skills():
-    policy = hierarchy(Automaton(STATES, ARROWS))
-    for seed in range(5):
-        place = int(Corridor().reset(seed=seed)[0][0])
-        assert story(policy, seed) == [("get_key", place), ("open_door", 6), ("leave", 1)]
 
 
 def test_an_automaton_whose_skills_may_not_start_says_so():

@@ -27,7 +27,6 @@ from skillweave import (
 from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.evolution import Evolution
 from skillweave.runs.directory import RunDirectory
-from skillweave.types import LastCall
 
 
 class GetKey(Skill):
@@ -90,7 +89,6 @@ def by_rule(obs):
 
 
 TREE = tree.Sequence(tree.Fallback(has_key, "get_key"), "open", "leave")
-READY = {"automaton": AUTOMATON, "function": by_rule, "tree": TREE}
 
 
 def declare(*skills, **how):
@@ -234,19 +232,6 @@ def test_a_selector_near_its_guide_does_what_the_guide_does(tmp_path):
                         guide_kl=0.02)  # fmt: skip
     assert near > 0.8 > free
     assert told[-1]["reference_kl"] < 0.2 * told[0]["reference_kl"]
-
-
-def test_a_function_that_is_told_of_calls_hears_of_those_that_were_made(tmp_path):
-    heard = []
-
-    def follow(obs, last: LastCall):
-        heard.append(last.skill.copy())
-        return np.zeros(len(obs), int)
-
-    declare(guide=follow, guide_restrict=False, guide_kl=1.0, skill_steps=64).train(
-        tmp_path / "run", quiet=True
-    )
-    assert len(np.unique(np.concatenate(heard))) > 2
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ from reporting.walkway import CALLS, Go, Stay, Walkway, choose, declare, played,
 from small_runs import stage_entry
 
 from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
-from skillweave.errors import DeclarationError
 from skillweave.reporting.report import timelines
 from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.facts import about, no_verdict, number, percent, verdict
@@ -263,11 +262,6 @@ def test_names_come_from_the_spec_the_environment_or_gymnasium():
     assert EnvSpec(Named, obs_names=["a", "b"]) == EnvSpec(Named)
     names = EnvSpec("CartPole-v1").observation_names()
     assert names == ("cart position", "cart speed", "pole angle", "pole angular speed")
-
-
-def test_a_name_is_given_once():
-    with pytest.raises(DeclarationError, match="obs_names"):
-        EnvSpec(Walkway, obs_names=["x", "x"])
 
 
 def test_known_names_are_as_many_as_the_numbers_of_an_observation():

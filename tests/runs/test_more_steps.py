@@ -512,11 +512,6 @@ def test_a_run_of_another_declaration_is_a_sentence(
     assert (path / "run.json").read_bytes() == before
 
 
-def test_resume_needs_a_directory() -> None:
-    with pytest.raises(DeclarationError, match="name its directory"):
-        declare().train(resume=True)
-
-
 def test_settings_that_differ_are_told(path: Path, capfd) -> None:
     declare().train(path, quiet=True)
     other = declare(algorithm=replace(ON, gamma=0.9))

@@ -302,11 +302,6 @@ def test_what_fails_or_returns_something_else_is_named():
     assert "module Pair returned a tuple" in says(from_torch(Pair()))
 
 
-def test_a_policy_without_spaces_says_that_it_needs_some():
-    with pytest.raises(SkillweaveError, match="module Linear has no spaces yet"):
-        acts(from_torch(linear()))
-
-
 def test_wrong_files_are_named(tmp_path):
     pytest.importorskip("stable_baselines3")
     pytest.importorskip("onnxruntime")
@@ -437,8 +432,3 @@ def test_a_copy_that_is_damaged_or_missing_is_said():
         load(now, b"junk")
     with pytest.raises(SkillweaveError, match=r"runs/x.*torch .*Linear.*another checksum"):
         load(now, None)
-
-
-def test_a_policy_that_fails_is_named_before_it_is_scored():
-    with pytest.raises(PolicyError, match="the policy: module Linear fails on observations"):
-        evaluate(from_torch(torch.nn.Linear(3, 2)), "CartPole-v1", episodes=1)

@@ -93,7 +93,7 @@ def test_each_environment_is_read_exactly(values):
     spec = telling(values)
     READ.clear()
     agents = {"algorithm": SMALL, "selector": SMALL}
-    sw.Hierarchy(spec, [Reads(values)], steps=256, **agents).train(quiet=True)
+    sw.Hierarchy(spec, [Reads(values)], steps=128, **agents).train(quiet=True)
     assert len(READ) > 50
 
 
