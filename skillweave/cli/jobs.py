@@ -88,7 +88,7 @@ class Processes:
 
 
 def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Do a job, and send its result or its error."""
+    """Do a job in its process, and send its result or its error."""
     _end_with_parent()
     result: Any = None
     problem: Exception | None = None
