@@ -42,7 +42,7 @@ from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 
 
 def run(command: commands.Output) -> Result:
-    """Carry a command out, and return its result."""
+    """Carry a command of the command line out, and return its result."""
     for field in fields(command):
         value = getattr(command, field.name)
         for word in value if isinstance(value, tuple) else (value,):

@@ -262,7 +262,7 @@ def replaced(config: Any, changes: Changes) -> Any:
 
 
 def _parse(name: str, text: str, hint: Any) -> Any:
-    """Return ``text`` as a value of the annotated type."""
+    """Return the ``text`` of a setting as a value of the annotated type."""
     options = options_of(hint)
     if type(None) in options and text.lower() in ("none", "null"):
         return None

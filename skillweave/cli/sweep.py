@@ -66,7 +66,7 @@ class Job:
     evaluate: int
 
     def run(self, code: bytes) -> float | str:
-        """Train it, or what is left of it, and evaluate it; return its mean return or an error."""
+        """Train a run of a sweep, or what is left of it; return its mean return, or an error."""
         try:
             if not (self.path.parent / MARK).exists():
                 raise RunError(
@@ -323,7 +323,7 @@ MARK = ".sweep"
 
 
 class Mark(TypedDict):
-    """Content of the file."""
+    """Content of a sweep's file: its recipe, and the checksum of its code."""
 
     recipe: str
     """The recipe, as the user named it."""
@@ -379,7 +379,7 @@ def code_files(recipe: Path) -> dict[str, Path]:
 
 
 def _checksum(files: Mapping[str, Path]) -> str:
-    """Return a checksum of the names of modules and the contents of their files."""
+    """Return a checksum of a recipe's modules: their names, and the contents of their files."""
     sums = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
     return hashlib.sha256(json.dumps(sums, sort_keys=True).encode()).hexdigest()
 

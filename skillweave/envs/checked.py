@@ -268,7 +268,7 @@ def _attribute(env: gym.Env[Any, Any], name: str) -> Any:
 
 
 def _takes_nothing(method: Any) -> bool:
-    """Return whether an object can be called without arguments."""
+    """Return whether an attribute of an environment can be called without arguments."""
     if not callable(method):
         return False
     try:

@@ -46,7 +46,7 @@ def deployed(policy: Policy) -> Deployed:
 
 
 def _compiled(policy: RowPolicy, name: str, *, sampled: bool) -> RowPolicy:
-    """Return a policy of plain data.
+    """Return a policy as plain data, with its networks as ONNX files.
 
     Args:
         name: its path: ``landing``, or ``outer/landing`` for a skill in a nested hierarchy.
@@ -119,7 +119,7 @@ def _hierarchy(policy: CallAndReturn, prefix: str, sampled: bool) -> CallAndRetu
 
 
 def _skill(skill: CalledSkill, prefix: str, knows: bool, *, sampled: bool) -> CalledSkill:
-    """Return a skill; ``knows``: its selector knows whether calls have succeeded."""
+    """Return a skill for export; ``knows``: its selector knows whether calls have succeeded."""
     goals = skill.goals
     if isinstance(goals, Goals):
         clip = goals.skill.clip_goal if goals.skill.defines("clip_goal") else None

@@ -154,7 +154,7 @@ class ExportedHierarchy(HierarchyPolicy):
 
 
 def _skill_set(deployed: Deployed) -> SkillSet:
-    """Return the skills of a hierarchy as reports know them."""
+    """Return the skills of an exported hierarchy, as reports know them."""
     tree = within(deployed.policy)
     return SkillSet(
         tuple(map(_recorded, tree.skills)),
@@ -176,7 +176,7 @@ def _policy(skill: CalledSkill, deployed: Deployed) -> Policy:
 
 
 def _recorded(called: CalledSkill) -> RecordedSkill:
-    """Return a skill with the functions that judge its calls."""
+    """Return a skill of an exported hierarchy, with the functions that judge its calls."""
     methods: dict[str, Any] = {
         name: staticmethod(function)
         for name in ("initiation", "termination", "success")
@@ -192,7 +192,7 @@ def _recorded(called: CalledSkill) -> RecordedSkill:
 
 
 def _reflexes(policy: RowPolicy) -> tuple[Reflex, ...]:
-    """Return the reflexes around a hierarchy."""
+    """Return the reflexes around an exported hierarchy."""
     found: list[Reflex] = []
     while isinstance(policy, Around):
         if isinstance(policy, Reflexes):

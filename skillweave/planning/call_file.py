@@ -83,7 +83,7 @@ class CallsHeader:
 
 
 def write_calls(path: str | Path, log: CallColumns, run: LoggedRun | None = None) -> None:
-    """Write a log into a file.
+    """Write a log of calls into a file.
 
     Args:
         run: the run in whose directory the file is; None: in none.
@@ -104,7 +104,7 @@ def write_calls(path: str | Path, log: CallColumns, run: LoggedRun | None = None
 
 
 def read_calls(path: str | Path) -> dict[str, Any]:
-    """Return the fields of a log in a file.
+    """Return the fields of a log of calls, from its file.
 
     Raises:
         RunError: the file is missing, damaged, or holds no log of calls.

@@ -82,7 +82,7 @@ def feature_maps(
     task: RewardMachine | None = None,
     skills: Sequence[int] | None = None,
 ) -> dict[int, FeatureMap]:
-    """Return the features of skills, by their places in the log.
+    """Return the features by which a log's calls are compared, by their skills' places.
 
     Args:
         log: the calls.

@@ -76,7 +76,7 @@ def _about(run: RunDirectory) -> str:
 
 
 def _shown(path: str) -> str:
-    """Return a picture, or a link where pages show no such picture."""
+    """Return a picture in the card, or a link where pages show no such picture."""
     link = f"[{text(PurePosixPath(path).stem)}](./{quote(path)})"
     return link if path.endswith(".mp4") else f"!{link}"
 
@@ -127,7 +127,7 @@ def _measured(saved: SavedEvaluation | None) -> str:
 
 
 def _handed_over(run: RunDirectory) -> list[str]:
-    """Return the section on the run's log of calls, if it has one that is of its skills."""
+    """Return the card's section on the run's log of calls, if that is of the run's skills."""
     matrix = handover_of(run)
     if matrix is None or isinstance(matrix, str):
         return []
@@ -152,13 +152,13 @@ def _training(run: RunDirectory) -> str:
 
 
 def _folded(title: str, head: tuple[str, str], rows: Mapping[str, Any]) -> str:
-    """Return a table that is folded until a reader opens it."""
+    """Return a table of the card that is folded until a reader opens it."""
     shown = _table(head, ([k, plain(v)] for k, v in rows.items()))
     return "\n".join([f"<details><summary>{title}</summary>", "", *shown, "", "</details>"])
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return the lines of a table."""
+    """Return the lines of a table of the card."""
     lines = ["| " + " | ".join(map(text, cells)) + " |" for cells in (head, *rows)]
     return [lines[0], "|" + " --- |" * len(head), *lines[1:]]
 

@@ -236,7 +236,7 @@ def _draw(
     width: float,
     height: float | None,
 ) -> tuple[Path, ...]:
-    """Draw the lines over ``words``, the title of their axis, and write the files."""
+    """Draw a figure's lines over ``words``, the title of their axis, and write its files."""
     with needs_extra("plotting", "plot"):
         import matplotlib
         from matplotlib.figure import Figure
@@ -283,7 +283,7 @@ def _save(figure: Any, out: Path) -> tuple[Path, ...]:
 
 
 def _steps(value: float, _: Any = None) -> str:
-    """Return steps for an axis: 200k, 1.5M."""
+    """Return steps as an axis of a figure shows them: 200k, 1.5M."""
     if abs(value) >= 1e6:
         return f"{value / 1e6:g}M"
     return f"{value / 1e3:g}k" if abs(value) >= 1e3 else f"{value:g}"

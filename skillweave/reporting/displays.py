@@ -34,7 +34,7 @@ class Row:
 
     @property
     def key(self) -> tuple[str, str]:
-        """Return the identity of a row."""
+        """Return the identity of a row of progress."""
         return self.under, self.name
 
 

@@ -76,7 +76,7 @@ def read_lineage(run: RunDirectory, stage: str) -> Lineage | None:
 
 
 def _sort(value: Any) -> str:
-    """Return the sort of a setting: a number, a word, or whole numbers."""
+    """Return the sort of a setting's value: a number, a word, or whole numbers."""
     if isinstance(value, list):
         return "numbers" if all(type(x) is int for x in value) else "?"
     return "number" if type(value) in (int, float) else type(value).__name__
@@ -105,7 +105,7 @@ def changes_words(born: LineageLine) -> str:
 
 
 def short_value(value: Any) -> str:
-    """Return a setting's value in few letters."""
+    """Return a setting's value in few letters, for figures of a population."""
     if isinstance(value, list):
         return "-".join(map(str, value))
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -32,7 +32,7 @@ def without_screen() -> Iterator[None]:
 
 @functools.cache
 def _has_egl() -> bool:
-    """Return whether the library is installed."""
+    """Return whether the library EGL is installed, which draws without a screen."""
     return ctypes.util.find_library("EGL") is not None
 
 

@@ -198,7 +198,7 @@ def enlarged(frame: Array) -> Array:
 
 
 def caption(frame: Array, text_left: str, color: RGB, text_right: str) -> Array:
-    """Return the frame above a dark band: the acting skill on its left, text on its right.
+    """Return a film's frame above a dark band: the acting skill on its left, text on its right.
 
     Nothing of the frame is covered. A frame narrower than ``MIN_WIDTH`` is enlarged k times. A
     left text too long for its room is shortened; where it is empty there is no chip.
@@ -239,7 +239,7 @@ def _font(size: int) -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _text(text: str, size: int, ink: RGB, ground: RGB) -> Array:
-    """Return one line of text, (line height, its width, 3)."""
+    """Return one line of a caption's text as a picture (line height, its width, 3)."""
     font = _font(size)
     box = (max(1, round(font.getlength(text))), sum(font.getmetrics()))
     image = extra("PIL.Image").new("RGB", box, ground)
@@ -249,7 +249,7 @@ def _text(text: str, size: int, ink: RGB, ground: RGB) -> Array:
 
 @functools.lru_cache(maxsize=256)
 def _chip(text: str, color: RGB, size: int, width: int) -> Array:
-    """Return a name on its colour, at most ``width`` pixels wide."""
+    """Return a skill's name on its colour for a caption, at most ``width`` pixels wide."""
     short = text
     pad = size // 2
     while text and _font(size).getlength(short) > width - 2 * pad:

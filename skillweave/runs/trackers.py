@@ -377,23 +377,23 @@ class Guarded(Tracker):
             self._failed = True
 
     def stage(self, name: str, budget: int) -> None:
-        """Forward it."""
+        """Forward the start of a stage to the tracker."""
         self._attempt(self._tracker.stage, name, budget)
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Forward it."""
+        """Forward the report of an update to the tracker."""
         self._attempt(self._tracker.tick, name, steps, seconds, metrics)
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Forward it."""
+        """Forward the end of a stage to the tracker."""
         self._attempt(self._tracker.done, name, steps, seconds, metrics)
 
     def film(self, path: Path, steps: int) -> None:
-        """Forward it."""
+        """Forward a film to the tracker."""
         self._attempt(self._tracker.film, path, steps)
 
     def close(self) -> None:
-        """Forward it."""
+        """Release the tracker."""
         self._attempt(self._tracker.close)
 
 

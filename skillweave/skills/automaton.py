@@ -112,7 +112,7 @@ class Automaton(ReadySelector):
 
     @cached_property
     def in_place(self) -> selectors.StateMachine:  # type: ignore[override]
-        """The rule that acts."""
+        """The acting rule of the automaton."""
         ordered = (
             names if isinstance(names, tuple) else tuple(filter(names.__contains__, self.skills))
             for names in self.states.values()

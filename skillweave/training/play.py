@@ -128,7 +128,7 @@ class SeededEpisodes:
         """(N, *obs_shape), the next observations."""
 
     def step(self, action: Array) -> PlayedStep:
-        """Act in ``rows``."""
+        """Step the environments of the episodes in ``rows``."""
         rows = self.rows
         obs = self.obs[rows]
         raw = self.engine.step(action, rows)

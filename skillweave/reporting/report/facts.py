@@ -27,7 +27,7 @@ NOTHING = "–"
 
 
 def number(value: float | None, scale: float | None = None) -> str:
-    """Return a number with three significant digits.
+    """Return a number for a report, with three significant digits.
 
     Args:
         scale: the scale of the numbers beside it, which get as many decimals; None: its own.
@@ -46,12 +46,12 @@ def number(value: float | None, scale: float | None = None) -> str:
 
 
 def scale_of(values: Iterable[float | None]) -> float:
-    """Return the largest size among numbers beside each other."""
+    """Return the largest size among numbers that a report shows beside each other."""
     return max((abs(value) for value in values if value is not None), default=0.0)
 
 
 def percent(value: float | None) -> str:
-    """Return a share as 42 %; one that is not quite nothing or all does not look like it."""
+    """Return a share for a report as 42 %; 0 % and 100 % are exact."""
     if value is None:
         return NOTHING
     if 0 < value < 0.005:
@@ -162,7 +162,7 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
 
 
 def plain(value: Any) -> str:
-    """Return a value of a setting, for people."""
+    """Return a value of a setting as reports show it."""
     if value is None:
         return "none"
     if isinstance(value, bool):
@@ -316,7 +316,7 @@ def _result(score: Evaluation) -> str:
 
 
 def _skills(skills: Mapping[str, SkillReport], total: int) -> list[str]:
-    """Return words on the skills that are used, and on one that fails."""
+    """Return words of the verdict on the skills that are used, and on one that fails."""
     if not skills:
         return []
     sentences = []
@@ -341,7 +341,7 @@ def _skills(skills: Mapping[str, SkillReport], total: int) -> list[str]:
 
 
 def _failing(name: str, report: SkillReport) -> str:
-    """Return a sentence on a skill that seldom succeeds."""
+    """Return a sentence of the verdict on a skill that seldom succeeds."""
     calls = report.counted
     if report.calls == 1:
         return f"`{name}` does not succeed in its only call"
@@ -351,6 +351,6 @@ def _failing(name: str, report: SkillReport) -> str:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names for a sentence."""
+    """Join names for a sentence of a report."""
     quoted = [f"`{name}`" for name in names]
     return quoted[0] if len(quoted) == 1 else f"{', '.join(quoted[:-1])} and {quoted[-1]}"

@@ -34,7 +34,7 @@ class Group:
 
 
 def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
-    """Return the groups, in the order of their first runs.
+    """Return runs as groups of seeds, in the order of their first runs.
 
     Raises:
         DeclarationError: no runs, or two that have the same seed and the same settings.

@@ -56,7 +56,7 @@ def add_handover(
     *,
     filmed: bool,
 ) -> None:
-    """Put the section for a log into a page.
+    """Put the handover section, made of a log of calls, into a report's page.
 
     Args:
         spec: of the environment; None: unknown, so nothing can be filmed.
@@ -132,7 +132,7 @@ def _words(
 
 
 def _end_row(ends: CallEnds) -> dict[str, Any]:
-    """Return how the calls of a skill end, in words."""
+    """Return a row of the section: the ends of a skill's calls, in words."""
     return {
         "name": ends.skill,
         "calls": f"{ends.calls:,}",
@@ -145,7 +145,7 @@ def _end_row(ends: CallEnds) -> dict[str, Any]:
 def _where_rows(
     log: CallLog, called: Sequence[str], named: ObsNames | None
 ) -> list[dict[str, Any]]:
-    """Return the middle 80 % of each coordinate where the calls of skills end."""
+    """Return rows of the section: the middle 80 % of each coordinate where skills' calls end."""
     rows = []
     for name, values in varying(coordinates(log.end, named)).items():
         scale = scale_of(np.quantile(values, (0.05, 0.95)).tolist())
@@ -221,7 +221,7 @@ def _goal(log: CallLog, row: int, with_goals: Mapping[str, Skill]) -> str:
 
 
 def _extent(log: CallLog, row: int) -> tuple[list[int], int, int]:
-    """Return the call before a call, if there is one, and the steps that are shown of each."""
+    """Return the call before a call, if there is one, and the steps of each that a film shows."""
     before = np.flatnonzero(log.followed_by == row)
     lead = int(log.tau[before].clip(max=LEAD).sum())
     return before.tolist(), lead, min(int(log.tau[row]), LONGEST)

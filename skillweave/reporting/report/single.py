@@ -315,7 +315,7 @@ def _add_scores(
 
 
 def score_words(score: Evaluation) -> dict[str, Any]:
-    """Return the score as texts; digits fit the scale of the returns."""
+    """Return an evaluation's score as texts of a report; digits fit the scale of the returns."""
     score_json = score.to_json()
     n = len(score.returns)
     count = solved(score)

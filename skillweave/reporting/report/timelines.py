@@ -138,7 +138,7 @@ def seen(calls: Array, named: ObsNames | None) -> dict[str, Array]:
 
 
 def rows_of(columns: Mapping[str, Array]) -> list[list[float | None]]:
-    """Return columns of numbers as rows for the page."""
+    """Return columns of numbers as rows for a report's page."""
     return [[*map(rounded, row)] for row in zip(*columns.values(), strict=True)]
 
 
