@@ -89,14 +89,9 @@ class Processes:
 
 
 def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-<<<<<<< HEAD
-    """Do a job, and send its result or its error."""
+    """Do a job in its process, and send its result or its error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     when_parent_ends(lambda: os._exit(1))
-=======
-    """Do a job in its process, and send its result or its error."""
-    _end_with_parent()
->>>>>>> h-d
     result: Any = None
     problem: Exception | None = None
     try:
