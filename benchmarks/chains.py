@@ -65,7 +65,7 @@ def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
     """
     every = {
         "episode_calls": 8,
-        "call_cost": 0.001,  # as measured; together, rooms other than 8x8 have none
+        "deliberation_cost": 0.001,  # as measured; together, rooms other than 8x8 have none
         "algorithm": doorkey.algorithm(ent_coef=0.03),  # with less `goal` settles too early
     }
     return Task(

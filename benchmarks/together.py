@@ -189,7 +189,7 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     "one call an episode": functools.partial(apart, episode_calls=1),
     "less entropy": less_entropy,
     "no start calls": functools.partial(apart, start_calls=None, episode_calls=1),
-    "large call cost": functools.partial(apart, call_cost=0.01),
+    "large call cost": functools.partial(apart, deliberation_cost=0.01),
     "low epsilon": functools.partial(otherwise, changed={"epsilon": 0.3, "epsilon_final": 0.02}),
     # The critic's errors are made as large as a success, where hardly anything was won yet.
     "no least deviation": functools.partial(learnt_otherwise, changed={"min_advantage_std": 0.0}),
@@ -197,9 +197,9 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     "no imitation": functools.partial(no_imitation, who=("algorithm", "selector")),
     "selector does not imitate": functools.partial(no_imitation, who=("selector",)),
     "no epsilon": functools.partial(otherwise, changed={"epsilon": 0.0, "epsilon_final": 0.0}),
-    "no call cost": functools.partial(together, call_cost=0.0),
+    "no call cost": functools.partial(together, deliberation_cost=0.0),
     # As `together` on 8x8, and refused there; in the other rooms `no call cost` is.
-    "small call cost": functools.partial(together, call_cost=0.001),
+    "small call cost": functools.partial(together, deliberation_cost=0.001),
     "task advantage": functools.partial(otherwise, changed={"task_weight": 1.0}),
     "no task advantage": functools.partial(otherwise, changed={"task_weight": 0.0}),
     "anchor": functools.partial(otherwise, changed={"reference_kl": 0.05}),

@@ -138,7 +138,7 @@ def declare(
         # won, a cost teaches the selector to call the skill with the longest calls, and in other
         # rooms that lasts long. There is none there, at the risk of calls that end at once again
         # and again.
-        "selection": sw.Selection(call_cost=0.001 if here else 0.0, greedy_skills=False),
+        "selection": sw.Selection(deliberation_cost=0.001 if here else 0.0, greedy_skills=False),
         "algorithm": learner,
         "selector": learner,
     } | how

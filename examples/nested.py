@@ -113,7 +113,7 @@ def declare(steps: int = 150_000, **how: Any) -> sw.Hierarchy:
         gae_lambda=0.98,
         network=sw.Network(hidden=(64, 64)),
     )
-    selection = sw.Selection(call_cost=0.01, greedy_skills=False)
+    selection = sw.Selection(deliberation_cost=0.01, greedy_skills=False)
     settings: dict[str, Any] = {"algorithm": learner, "selector": learner, "selection": selection}
     errands: list[Any] = [
         sw.Hierarchy(env, [Fetch(name), Deliver(name)], call_steps=30, name=name, **settings)

@@ -420,7 +420,7 @@ DECLARED = (
     "start_calls",
     "search_steps",
     "episode_calls",
-    "call_cost",
+    "deliberation_cost",
     "greedy_skills",
     "greedy_selector",
     "target_return",

@@ -50,7 +50,7 @@ def level_entry(**fields: Any) -> LevelEntry:
     """The entry of a hierarchy that learns apart."""
     plain: dict[str, Any] = {"learn": "apart", "call_steps": 10, "interrupt": None}
     plain |= {"greedy_skills": True, "greedy_selector": True, "start_calls": None}
-    plain |= {"search_steps": None, "episode_calls": 1, "call_cost": 0.0, "reflexes": []}
+    plain |= {"search_steps": None, "episode_calls": 1, "deliberation_cost": 0.0, "reflexes": []}
     return LevelEntry(**plain | fields)
 
 

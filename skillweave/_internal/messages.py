@@ -56,6 +56,8 @@ ELSEWHERE = {
 }
 """Names that users of other libraries type, of settings and of a skill's attributes, with the names
 here, or with a sentence on what to do instead. At most 30: similar names are found without it."""
+RENAMED = {"call_cost": "deliberation_cost"}
+"""Earlier names of settings, with those of now."""
 
 
 def short(value: object, longest: int = 100) -> str:
@@ -111,7 +113,7 @@ def suggest(
     spelled = {p.lower().replace("-", "_"): p for p in places}
     wanted = str(name).lower().replace("-", "_")
     similar = difflib.get_close_matches(wanted, spelled, 1, least)
-    for spelling in (wanted, ELSEWHERE.get(wanted, ""), *similar):
+    for spelling in (wanted, (ELSEWHERE | RENAMED).get(wanted, ""), *similar):
         if near := spelled.get(spelling):
             where = f"it is {places[near]}" if places[near] else ""
             if near == name:

@@ -101,7 +101,9 @@ def to_train(
         "selector": algorithm,
         "rest": rest,
         "reflexes": skills.reflexes,
-        "selection": Selection(call_cost=skills.call_cost, greedy_skills=skills.greedy),
+        "selection": Selection(
+            deliberation_cost=skills.deliberation_cost, greedy_skills=skills.greedy
+        ),
         "guide": guide,
     }
 

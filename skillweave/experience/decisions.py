@@ -147,7 +147,7 @@ class OpenCalls:
         env = ends["env"]
         cut = ends["cut"]
         values = self._at_decisions(trace, ends) | {
-            "reward": (ends["reward"] - self.level.skill_set.call_cost).astype(np.float32),
+            "reward": (ends["reward"] - self.level.skill_set.deliberation_cost).astype(np.float32),
             "steps": ends["steps"],
             "terminated": steps["terminated"][row, env] & ~cut,
             "truncated": steps["truncated"][row, env] | cut,

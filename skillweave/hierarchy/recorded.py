@@ -70,7 +70,7 @@ def level_entry(roles: Roles, level: Level) -> LevelEntry:
         start_calls=apart.start_calls,
         search_steps=apart.search_steps,
         episode_calls=apart.episode_calls,
-        call_cost=selection.call_cost,
+        deliberation_cost=selection.deliberation_cost,
         reflexes=[reflex.name for reflex in level.reflexes],
         selector=None if ready is None else source_of(ready),
         guide=guided,
@@ -98,7 +98,7 @@ def with_entry(level: Level, entry: LevelEntry) -> Level:
         ),
         selection=replace(
             level.selection,
-            call_cost=entry.call_cost,
+            deliberation_cost=entry.deliberation_cost,
             greedy_skills=entry.greedy_skills,
             greedy_selector=entry.greedy_selector,
         ),

@@ -154,7 +154,7 @@ class Level(LimitedCalls, Settings):
             tuple(self.reflexes),
             self.call_steps,
             self.selection.greedy_skills is not False,
-            self.selection.call_cost,
+            self.selection.deliberation_cost,
             greedy_selector=self.selection.greedy_selector is not False,
             parts=self._parts(skills),
         )

@@ -62,7 +62,7 @@ class Selection:
         DeclarationError: a value is out of its range.
     """
 
-    call_cost: NonNegative = 0.0
+    deliberation_cost: NonNegative = 0.0
     """Cost of each decision while the selector learns, in units of reward (a deliberation cost,
     Harb et al. 2018), so that calls which change nothing are worth less. A cost above the
     discounted reward makes long calls best."""

@@ -94,7 +94,7 @@ class LevelEntry:
     start_calls: AtLeastOne | tuple[str, ...] | None
     search_steps: AtLeastOne | None
     episode_calls: AtLeastOne
-    call_cost: NonNegative
+    deliberation_cost: NonNegative
     reflexes: list[str]
     selector: Source | None = None
     """The source of a ready selector; None: it is trained."""

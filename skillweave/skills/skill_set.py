@@ -46,7 +46,7 @@ class SkillSet(LimitedCalls):
     greedy: bool = True
     """Skills act greedily; else they sample."""
 
-    call_cost: float = 0.0
+    deliberation_cost: float = 0.0
     """Cost of each call for a selector that learns, in units of reward."""
     interruption: Interruption | None = None
     """Rule by which the selector cuts a call; None: it never does."""

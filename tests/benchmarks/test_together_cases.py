@@ -148,7 +148,7 @@ def test_who_learns_is_the_same_but_for_what_a_case_names():
 
 def test_calls_cost_something_where_successes_come_early_or_skills_learn_apart():
     costs = {
-        (task, case): CASES[case](TASKS[task], 1_000).selection.call_cost  # type: ignore[union-attr]
+        (task, case): CASES[case](TASKS[task], 1_000).selection.deliberation_cost  # type: ignore[union-attr]
         for task in ("8x8", "16x16")
         for case in ("together", "apart", "then")
     }

@@ -107,7 +107,7 @@ EVOLVE = Evolution(population=2, generations=2, episodes=2)
         ({}, {"call_steps": 7}, "call_steps is 6 (declared now: 7)"),
         ({}, {"start_calls": 3}, "start_calls is none (declared now: 3)"),
         ({}, {"episode_calls": 3}, "episode_calls is 1 (declared now: 3)"),
-        ({}, {"call_cost": 0.5}, "call_cost is 0 (declared now: 0.5)"),
+        ({}, {"deliberation_cost": 0.5}, "deliberation_cost is 0 (declared now: 0.5)"),
         ({"evolve": {"left": EVOLVE}}, {}, ""),
     ],
 )
@@ -120,13 +120,13 @@ def test_settings_that_differ_are_told_where_a_run_goes_on(tmp_path, capsys, fir
     assert ("continues with its own settings" in told) == bool(says)
     assert says in told
     assert run.info()["stages"][0]["algorithm"]["gamma"] == ON.gamma
-    assert run.hierarchy.selection.call_cost == 0.0
+    assert run.hierarchy.selection.deliberation_cost == 0.0
     assert RunDirectory.open(tmp_path / "run").finished
 
 
 def test_a_cost_of_calls_below_that_differs_is_told(tmp_path, capsys):
     def whole(cost):
-        inner = declare(skills=[Left(), Push()], call_cost=cost, name="inner")
+        inner = declare(skills=[Left(), Push()], deliberation_cost=cost, name="inner")
         return declare(skills=[Balance(), inner])
 
     with interrupted(1):
@@ -134,26 +134,26 @@ def test_a_cost_of_calls_below_that_differs_is_told(tmp_path, capsys):
     capsys.readouterr()
     whole(0.5).resume(tmp_path / "run")
     told = "".join(capsys.readouterr())
-    assert "skills.inner.hierarchy.call_cost is 0 (declared now: 0.5)" in told
+    assert "skills.inner.hierarchy.deliberation_cost is 0 (declared now: 0.5)" in told
 
 
 def test_what_is_told_to_count_is_what_counts(tmp_path, monkeypatch, capsys):
     class Left(SmallLeft):
         pass
 
-    whole = declare(skills=[Left(), Balance()], call_cost=0.5)
+    whole = declare(skills=[Left(), Balance()], deliberation_cost=0.5)
     whole.train(tmp_path / "whole", seed=3, quiet=True)
     with interrupted(1):
         whole.train(tmp_path / "run", seed=3, quiet=True)
     monkeypatch.setattr(Left, "max_steps", 4)
     monkeypatch.setattr(Left, "call_steps", 3)
     capsys.readouterr()
-    other = declare(skills=[Left(), Balance()], call_cost=0.1)
+    other = declare(skills=[Left(), Balance()], deliberation_cost=0.1)
     other.resume(tmp_path / "run")
     told = "".join(capsys.readouterr())
     assert "skills.left.max_steps is 15 (declared now: 4)" in told
-    assert "call_cost is 0.5 (declared now: 0.1)" in told
-    assert (other.skills[0].max_steps, other.selection.call_cost) == (4, 0.1)
+    assert "deliberation_cost is 0.5 (declared now: 0.1)" in told
+    assert (other.skills[0].max_steps, other.selection.deliberation_cost) == (4, 0.1)
     assert_same(tmp_path / "run", tmp_path / "whole")
 
 
