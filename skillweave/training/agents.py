@@ -39,7 +39,7 @@ from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Loop, LoopState, Saved
 from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 from skillweave.training.rehearsal import rehearse
-from skillweave.training.replay_learner import learner_of
+from skillweave.training.stack_learner import learner_of
 from skillweave.training.stage import Together
 from skillweave.training.stage_log import StageLog, resumed, success_rate
 from skillweave.training.stage_run import StageRun
@@ -253,7 +253,10 @@ class Agents:
         return Reference(params, torch.ones(1, dtype=torch.float32, device=device), kl / rate)
 
     def _quota(self, name: str) -> int | None:
-        """Return the valid rows that a learner from rollouts waits for; None: as one alone does."""
+        """Return the valid rows that a learner from rollouts waits for; None: see ``learner_of``.
+
+        Among learners that learn together it is ``together.quota`` of the rows of a rollout.
+        """
         together = self.together
         config = self.algorithms[name].config
         if together is None or self.algorithms[name].store != "rollout":
