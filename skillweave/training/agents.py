@@ -75,6 +75,8 @@ class Agents:
         self.together: Together | None = None
         if entry.together is not None:
             self.together = fit(Together, entry.together, file, f"stage {entry.name!r}: together")
+        self._reached: float | None = None
+        """The value by which the target is reached; None: it is not."""
         self._resources = ExitStack()
         self._make_collectors = make_collectors
 
@@ -314,16 +316,15 @@ class Agents:
         log = self.log
         steps = self.loop.at.steps
         made = self.collectors.steps_made
-        try:
-            self.loop.run()
-        except (_TargetReached, _Stopped) as end:
+        self.loop.run()
+        if self.loop.ended:
             # Count the steps collected since the update, too.
             log.at.steps = steps + self.collectors.steps_made - made
-            if isinstance(end, _Stopped):
+            if self._reached is None:
                 log.stopped()
                 self._save_final(spent=False)
             else:
-                log.reached(end.args[0])
+                log.reached(self._reached)
         else:
             self._save_final(spent=True)
             if self.entry.kind == "skill" and self._is_unchanged():
@@ -338,7 +339,7 @@ class Agents:
         return self.policies()
 
     def _on_tick(self, tick: Tick) -> None:
-        """Evaluate where it is due, and write a report; raise at the end of the stage."""
+        """Evaluate where it is due, and write a report; end at the target, or for a callback."""
         log = self.log
         best = self.best
         budget = self.entry.budget
@@ -359,18 +360,16 @@ class Agents:
         # No checkpoint at the end: a run that resumes from the previous one comes here again.
         target = self.entry.target
         if target is not None:
-            value = target.reached(evaluation, self.entry.name)
-            if value is not None:
-                raise _TargetReached(value)
-        if log.stop_requested:
-            raise _Stopped
+            self._reached = target.reached(evaluation, self.entry.name)
+        if self._reached is not None or log.stop_requested:
+            self.loop.end()
 
     def _on_checkpoint(self, saved: Saved) -> None:
-        """Write a checkpoint; raise where a callback ends the stage."""
+        """Write a checkpoint; end where a callback ends the stage."""
         self.log.stands(saved.at.update, saved.at.steps, saved.at.seconds)
         self.log.save(self._saved(saved.extra))
         if self.log.stop_requested:
-            raise _Stopped
+            self.loop.end()
 
     def _saved(self, extra: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return all tensors of a checkpoint, ``extra`` included."""
@@ -455,11 +454,3 @@ def _acting_in(
         (alone,) = acting.values()
         return Collector(engine, alone, task.who)
     return Collector(engine, acting.pop(SELECTOR, None), task.who, acting, margins)
-
-
-class _TargetReached(Exception):
-    """Signal that ends a loop: the target is reached by this value."""
-
-
-class _Stopped(Exception):
-    """Signal that ends a loop: a callback has returned False."""
