@@ -66,7 +66,7 @@ from skillweave.skills.skill_set import SkillSet
 from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack
 from skillweave.training.loop import Loop
-from skillweave.training.replay_learner import learner_of
+from skillweave.training.stack_learner import learner_of
 from skillweave.types import Array
 
 GAMMA, GOALS = 0.9, {"G1": G1, "G2": G2}

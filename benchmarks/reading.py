@@ -29,8 +29,8 @@ from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack
 from skillweave.training.learning_task import skill_task
 from skillweave.training.loop import Loop
-from skillweave.training.replay_learner import learner_of
 from skillweave.training.role import agent_role
+from skillweave.training.stack_learner import learner_of
 
 ROOT = Path(skillweave.__file__).parent
 PAGE = Path(__file__).parents[1] / "docs" / "one-gradient.md"

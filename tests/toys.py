@@ -35,7 +35,8 @@ from skillweave.spaces import pack
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Learner, Stack
 from skillweave.training.loop import Loop, LoopState, Saved
-from skillweave.training.replay_learner import ReplayLearner, learner_of, store_of
+from skillweave.training.replay_learner import ReplayLearner, store_of
+from skillweave.training.stack_learner import learner_of
 from skillweave.types import Array
 
 

@@ -1,4 +1,4 @@
-"""The collector: N environments, who acts in them, and their open episodes between requests."""
+"""The collector: N environments, the policies in them, and their open episodes between requests."""
 
 from __future__ import annotations
 
@@ -68,22 +68,24 @@ class Collected:
 
 
 class Collector:
-    """A collector: it steps N environments with a policy, and returns each learner's rows.
+    """N environments in which policies act, and which return rows to learn from.
 
-    Equal requests, seeds and ``state`` give equal rows.
+    A request names the number of steps, the weights and the seeds. Its rows follow from these and
+    from the ``state`` before it, so a collector in another process, or one that is restored from a
+    checkpoint, returns the same rows. Episodes stay open between requests; ``state`` holds their
+    seeds and actions, by which ``restore`` plays them again.
 
-    A skill that has goals gets one where a call of it starts, by ``Skill.goals``, until it ends.
-    A checkpoint ends no episode: ``state`` holds what is needed to play the open ones again.
+    A skill that has goals gets one at the start of each call, by ``Skill.goals``.
 
     Args:
-        engine: the environments; they are reset by ``start``, or stand where ``restore`` puts them.
-        acting: the plain agent, the skill, or the selectors that learn; None: the guide decides, or
-            only ``like`` is to act.
-        who: the policies that act.
-        learners: by path, all others that learn: ``skill``, ``inner/skill``, ``inner/selector``;
-            ``skill_critic`` and ``inner/skill_critic`` say what skills are worth. None: one alone
-            learns, at the path ""; else a selector has the path ``selector``.
-        margins: by the paths of critics: calls end where a new decision is worth this much more.
+        engine: the environments; ``start`` resets them, or ``restore`` brings them into a state.
+        acting: the policy that learns and acts: the plain agent, the skill, or the selector. None:
+            a guide decides, or the collector is only a template for ``like``.
+        who: a plain agent or skill that acts alone (``Alone``), or a hierarchy (``Calling``).
+        learners: the other learners of a hierarchy, by path: ``skill``, ``inner/skill``,
+            ``inner/selector``, and the critics of skills, ``skill_critic``. None: one policy learns
+            alone, at the path "".
+        margins: by the path of a critic, the gain in value at which a new decision ends a call.
     """
 
     def __init__(
@@ -104,11 +106,11 @@ class Collector:
         self._together = learners is not None
         self._goals = goals_of(self.skill)
         self.obs: Array = np.empty(0)
-        """(N, *obs_shape), the observations to act on next."""
+        """(N, *obs_shape), the latest observations."""
         self.open: dict[str, Array] = {}
-        """Numbers of open calls, (N, …) each, whose shape is known only when a call starts."""
+        """Arrays (N, …) of open calls; they are made when the first call starts."""
         self.search: Search | None = None
-        """The search for a start of the skill; None: it starts wherever episodes do."""
+        """The search for states in which the skill may start; None: episodes start in one."""
         self.limit = None if self.skill is None else self.skill.max_steps
         """The most steps of a call of the skill; None: any number."""
         self.learning: OneLearner | LevelLearners
@@ -125,9 +127,10 @@ class Collector:
             **flat(self.memory, "player."),
             **self.learning.kept,
         }
-        """State of each environment between requests, (N, …) each; changed in place."""
+        """Arrays (N, …) by name that a checkpoint stores, changed in place: of the open episodes,
+        the memory of the policy (``player.…``), and of the learners."""
         self.after_request = {"sums", *self.learning.kept}
-        """Names in ``kept`` that change when the steps of a request are judged, not in a step."""
+        """Names in ``kept`` of arrays that change at the end of a request, not in each step."""
         if self._goals is not None:
             self.kept["goal"] = self._goals.start(n)
             self.kept["needs_goal"] = np.ones(n, bool)  # a call starts
@@ -138,11 +141,12 @@ class Collector:
             self._last_actions = space_of(engine.action_space)
             self.kept["last_action"] = self._last_actions.start(n)
         self.overridden = np.zeros(n, bool) if self.learning.overrides else None
-        """(N,), where reflexes acted in the latest step; None: not recorded."""
+        """(N,) bool, where reflexes acted in the latest step; None: not recorded."""
         ends = self.skill is not None and self.skill.defines("termination")
         self._asks = self.policy.watches or self.search is not None or ends
-        """Something is asked about each step while it is made."""
+        """Each step is shown to a policy or a skill at once, not only at the end of a request."""
         self.begun = False
+        """The environments were reset."""
         self._all = np.arange(n)
         self.log_info: tuple[str, ...] = ()
         """I keys of ``info`` whose values at the ends of episodes are logged."""
@@ -150,7 +154,7 @@ class Collector:
         """Keys of ``info`` in the log of calls; None: none is kept."""
         self._info_keys: set[str] = set()
         self._ended: list[tuple[int, Array, Array]] = []
-        """Episodes that ended in a request: row, environments, and numbers without sums."""
+        """Episodes that ended in the request: the row, environments, and numbers but sums."""
 
     def like(self, engine: Engine, acting: Acting) -> Collector:
         """Return a collector of the same kind over other environments."""
@@ -273,8 +277,8 @@ class Collector:
         self._clear(ids)
         return self._begin_anew(ids)
 
-    def finish(self, _: None = None) -> None:
-        """Check at the end of training that it has left nothing in the environments."""
+    def finish(self) -> None:
+        """Check at the end of training what it has left in the environments."""
         self.engine.finish()
 
     def close(self) -> None:

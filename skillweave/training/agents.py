@@ -39,7 +39,7 @@ from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Loop, LoopState, Saved
 from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 from skillweave.training.rehearsal import rehearse
-from skillweave.training.replay_learner import learner_of
+from skillweave.training.stack_learner import learner_of
 from skillweave.training.stage import Together
 from skillweave.training.stage_log import StageLog, resumed, success_rate
 from skillweave.training.stage_run import StageRun
@@ -75,6 +75,8 @@ class Agents:
         self.together: Together | None = None
         if entry.together is not None:
             self.together = fit(Together, entry.together, file, f"stage {entry.name!r}: together")
+        self._reached: float | None = None
+        """The value by which the target is reached; None: it is not."""
         self._resources = ExitStack()
         self._make_collectors = make_collectors
 
@@ -253,7 +255,10 @@ class Agents:
         return Reference(params, torch.ones(1, dtype=torch.float32, device=device), kl / rate)
 
     def _quota(self, name: str) -> int | None:
-        """Return the rows that a rollout learner waits for beside others; None: its own default."""
+        """Return the valid rows that a learner from rollouts waits for; None: see ``learner_of``.
+
+        Among learners that learn together it is ``together.quota`` of the rows of a rollout.
+        """
         together = self.together
         config = self.algorithms[name].config
         if together is None or self.algorithms[name].store != "rollout":
@@ -311,16 +316,15 @@ class Agents:
         log = self.log
         steps = self.loop.at.steps
         made = self.collectors.steps_made
-        try:
-            self.loop.run()
-        except (_TargetReached, _Stopped) as end:
+        self.loop.run()
+        if self.loop.ended:
             # Count the steps collected since the update, too.
             log.at.steps = steps + self.collectors.steps_made - made
-            if isinstance(end, _Stopped):
+            if self._reached is None:
                 log.stopped()
                 self._save_final(spent=False)
             else:
-                log.reached(end.args[0])
+                log.reached(self._reached)
         else:
             self._save_final(spent=True)
             if self.entry.kind == "skill" and self._is_unchanged():
@@ -335,7 +339,7 @@ class Agents:
         return self.policies()
 
     def _on_tick(self, tick: Tick) -> None:
-        """Evaluate where it is due, and write a report; raise at the end of the stage."""
+        """Evaluate where it is due, and write a report; end at the target, or for a callback."""
         log = self.log
         best = self.best
         budget = self.entry.budget
@@ -356,18 +360,16 @@ class Agents:
         # No checkpoint at the end: a run that resumes from the previous one comes here again.
         target = self.entry.target
         if target is not None:
-            value = target.reached(evaluation, self.entry.name)
-            if value is not None:
-                raise _TargetReached(value)
-        if log.stop_requested:
-            raise _Stopped
+            self._reached = target.reached(evaluation, self.entry.name)
+        if self._reached is not None or log.stop_requested:
+            self.loop.end()
 
     def _on_checkpoint(self, saved: Saved) -> None:
-        """Write a checkpoint; raise where a callback ends the stage."""
+        """Write a checkpoint; end where a callback ends the stage."""
         self.log.stands(saved.at.update, saved.at.steps, saved.at.seconds)
         self.log.save(self._saved(saved.extra))
         if self.log.stop_requested:
-            raise _Stopped
+            self.loop.end()
 
     def _saved(self, extra: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return all tensors of a checkpoint: the learners' states, and ``extra``."""
@@ -452,11 +454,3 @@ def _acting_in(
         (alone,) = acting.values()
         return Collector(engine, alone, task.who)
     return Collector(engine, acting.pop(SELECTOR, None), task.who, acting, margins)
-
-
-class _TargetReached(Exception):
-    """Signal that ends a loop: the target is reached by this value."""
-
-
-class _Stopped(Exception):
-    """Signal that ends a loop: a callback has returned False."""

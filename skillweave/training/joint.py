@@ -89,7 +89,8 @@ class JointLearner:
     def _task_advantage(self, rows: Batch) -> Array:
         """Return the task's advantage of each step, (T, N) float32, with standard deviation 1.
 
-        Small advantages have less, in units of reward: see ``PPO.min_advantage_std``.
+        Small advantages have less, in units of reward: see ``PPO.min_advantage_std``. It becomes a
+        column of the skills' batches, whose columns are arrays until a store gathers their rows.
         """
         (stack,) = self.learners[self._critic].stacks
         store = RolloutStore(1, device=stack.state.params.device)

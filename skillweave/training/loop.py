@@ -115,11 +115,17 @@ class Loop:
     """Environment steps between checkpoints. They are also written by time
     (``CHECKPOINT_SECONDS``), and on an interrupt."""
     on_tick: Callable[[Tick], None] | None = None
-    """Called with each report; may raise to stop."""
+    """Called with each report; may call ``end``."""
     on_checkpoint: Callable[[Saved], None] | None = None
-    """Writes a checkpoint; None: the loop writes none, and ignores interrupts."""
+    """Writes a checkpoint; may call ``end``. None: the loop writes none, and ignores interrupts."""
     on_calls: Callable[[Batch], None] | None = None
     """Records the calls in new steps, where collectors return them."""
+    ended: bool = False
+    """``end`` was called."""
+
+    def end(self) -> None:
+        """Learn no more, whatever is left of the budget; ``run`` then returns."""
+        self.ended = True
 
     def restore(self, saved: dict[str, Tensor]) -> Array:
         """Continue from a checkpoint, or in new episodes from the final state of a stage.
@@ -147,7 +153,7 @@ class Loop:
         return restarted
 
     def run(self) -> LoopState:
-        """Train until the ``budget`` is spent; return the counts at the end.
+        """Train until the ``budget`` is spent, or ``end`` is called; return the counts at the end.
 
         Raises:
             TrainingError: parameters or losses are no longer finite.
@@ -163,9 +169,10 @@ class Loop:
             try:
                 self.collectors.start(self.seeds / "start")
                 self._request()
-                while self.at.steps < self.budget:
+                while self.at.steps < self.budget and not self.ended:
                     self._round()
-                self._report()
+                if not self.ended:
+                    self._report()
             finally:
                 self._thread.close()  # after a pending update, as it changes states in place
         return self.at
@@ -177,6 +184,8 @@ class Loop:
         if self.on_calls is not None and collected.calls is not None:
             self.on_calls(collected.calls)
         self._report()
+        if self.ended:
+            return
         before, update = at.steps, at.update
         at.steps += collected.steps
         at.update += 1
@@ -191,6 +200,8 @@ class Loop:
         self._start_update(update, not every or over or crossed(every, before, at.steps))
         if not learner.overlap:
             self._report()
+            if self.ended:
+                return
             if not over:
                 self._request()
         if not over:
@@ -247,7 +258,7 @@ class Loop:
         stopping = interrupts.requested()
         if stopping or self.is_due(before):
             self._save()
-        if stopping:
+        if stopping and not self.ended:
             interrupts.stop()
 
     def is_due(self, before: int) -> bool:

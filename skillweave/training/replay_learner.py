@@ -19,7 +19,7 @@ from skillweave.experience.acting import ActionRepeat, Request
 from skillweave.ops.device import resolve_device
 from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
-from skillweave.training.learner import RolloutLearner, Stack, acting_of, member_seeds
+from skillweave.training.learner import Stack, acting_of, member_seeds
 
 DRAWN_AT_ONCE = 8
 """Gradient steps whose samples are drawn at once."""
@@ -251,31 +251,6 @@ def store_of(
         raw=algorithm.raw,
         device=resolve_device(config.device),
     )
-
-
-def learner_of(
-    stack: Stack,
-    num_envs: int,
-    seeds: Seeds,
-    quota: int | None = None,
-    *,
-    row_steps: int = 1,
-    goes_on_at: int = 0,
-) -> RolloutLearner | ReplayLearner:
-    """Return the learner of one stack of members: from rollouts or replay, by its algorithm.
-
-    Args:
-        quota: see ``RolloutLearner``; None: half of a rollout, where a row is a step.
-        row_steps, goes_on_at: see ``ReplayLearner``.
-    """
-    if stack.algorithm.store == "rollout":
-        if quota is None:
-            # A skill that can seldom start waits until a batch is large enough.
-            full = int(stack.algorithm.config.n_steps) * num_envs // stack.members
-            quota = full // 2 if row_steps == 1 else 0
-        return RolloutLearner(stack, seeds, quota)
-    store = store_of(stack.algorithm, num_envs, stack.members)
-    return ReplayLearner([stack], store, seeds, row_steps=row_steps, goes_on_at=goes_on_at)
 
 
 def _rows(x: Array, columns: slice, stack: Stack) -> Tensor:

@@ -481,6 +481,6 @@ def stuck_selector(exploring: float, alone: float, skills: Mapping[str, SkillRep
         "The latest training episodes, with some calls chosen at random, had a mean return of "
         f"{exploring:.4g}; without such calls the best is {alone:.4g}. A greedy selector calls "
         f"{name!r} in {share:.0%} of its decisions, for {report.length_mean or 0.0:.1f} steps "
-        f"each: {done}let each call cost a little (Selection(deliberation_cost=0.001)), or give more "
-        "steps."
+        f"each: {done}let each call cost a little (Selection(deliberation_cost=0.001)), or give "
+        "more steps."
     )

@@ -103,12 +103,33 @@ class WorkerHost:
         self.collector = make(each, number * each)
 
     def answer(self, what: str, task: Any) -> Any:
-        """Do a task by the collector's method of this name; a request is for all workers."""
-        if what == "state":
-            return self.collector.state()
-        if what != "collect":
-            return getattr(self.collector, what)(task)
-        found = self.collector.collect(task.of_collector(self.number))
+        """Do a task by the method of the collector, or part of a population, of its name.
+
+        Args:
+            what: "collect", "start", "state", "restore" or "finish", of a collector; "train",
+                "fitness", "state" or "restore", of a part of a population.
+            task: the method's argument; a request is for all workers. None: it has none.
+        """
+        match what:
+            case "collect":
+                return self._collect(task)
+            case "start":
+                return self.collector.start(task)
+            case "state":
+                return self.collector.state()
+            case "restore":
+                return self.collector.restore(task)
+            case "finish":
+                return self.collector.finish()
+            case "train":
+                return self.collector.train(task)
+            case "fitness":
+                return self.collector.fitness(task)
+        raise AssertionError(f"no worker is asked for {what!r}")
+
+    def _collect(self, task: Request) -> Collected:
+        """Return this worker's part of a request, with checksums of where it stands then."""
+        found: Collected = self.collector.collect(task.of_collector(self.number))
         kept = self.collector.kept  # where few observations are possible, they alone tell little
         about = np.column_stack([kept["age"], kept["sums"]])
         found.stands = checksums(self.collector.obs) + checksums(about)

@@ -11,7 +11,7 @@ from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.experience.acting import Acting, ActionRepeat, Request
 from skillweave.training.learner import Stack
-from skillweave.training.replay_learner import learner_of
+from skillweave.training.stack_learner import learner_of
 
 N, LONGEST = 64, 12
 OBS = np.zeros((N, 3), np.float32)  # all see the same, so one who does not explore does the same

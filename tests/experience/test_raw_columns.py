@@ -20,7 +20,8 @@ from skillweave.buffers.rollout import RolloutStore
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.skills import Skill
 from skillweave.training.learner import Stack
-from skillweave.training.replay_learner import learner_of, store_of
+from skillweave.training.replay_learner import store_of
+from skillweave.training.stack_learner import learner_of
 
 N = 5
 GAMMA = torch.tensor([0.9])

@@ -35,8 +35,8 @@ from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack
 from skillweave.training.learning_task import skill_task
 from skillweave.training.loop import LoopState
-from skillweave.training.replay_learner import learner_of
 from skillweave.training.role import agent_role
+from skillweave.training.stack_learner import learner_of
 from skillweave.workers.placement import make_collectors
 
 CONFIG = PPO(

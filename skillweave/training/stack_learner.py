@@ -1,0 +1,40 @@
+"""The learner of one stack: from rollouts or from replay, as its algorithm stores experience."""
+
+from __future__ import annotations
+
+from skillweave._internal.seeding import Seeds
+from skillweave.training.learner import RolloutLearner, Stack
+from skillweave.training.replay_learner import ReplayLearner, store_of
+
+LEAST_SHARE = 0.5
+"""The share of a rollout's rows from which a learner of steps learns.
+
+A skill acts in some of the steps alone, so its batches differ in size. Small ones make noisy
+updates, so it waits for half of a rollout. A whole one would often take a second rollout, when the
+rows of the first are of older weights. A learner that acts in every step never waits.
+"""
+
+
+def learner_of(
+    stack: Stack,
+    num_envs: int,
+    seeds: Seeds,
+    quota: int | None = None,
+    *,
+    row_steps: int = 1,
+    goes_on_at: int = 0,
+) -> RolloutLearner | ReplayLearner:
+    """Return the learner of one stack.
+
+    Args:
+        quota: see ``RolloutLearner``; None: ``LEAST_SHARE`` of a rollout where a row is a step,
+            and any number of decisions, which are fewer than steps.
+        row_steps, goes_on_at: see ``ReplayLearner``.
+    """
+    if stack.algorithm.store == "rollout":
+        if quota is None:
+            rows = int(stack.algorithm.config.n_steps) * num_envs // stack.members
+            quota = int(LEAST_SHARE * rows) if row_steps == 1 else 0
+        return RolloutLearner(stack, seeds, quota)
+    store = store_of(stack.algorithm, num_envs, stack.members)
+    return ReplayLearner([stack], store, seeds, row_steps=row_steps, goes_on_at=goes_on_at)
