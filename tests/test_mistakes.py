@@ -528,6 +528,7 @@ WARNED = {
     "terminaton": ({"terminaton": lambda _, step: step.next_obs[:, 0] > 1}, "termination"),
     "done": ({"done": lambda _, step: step.next_obs[:, 0] > 1}, "termination"),
     "max_step": ({"max_step": 5}, "max_steps"),
+    "rewards": ({"rewards": overwrite}, "reward"),
     "time_limit": ({"time_limit": 5}, "max_steps"),
     "predict": ({"predict": lambda _, obs: zeros(_, obs)}, "policy"),
     "rest": ({"rest": 0.0}, "Hierarchy.rest"),
@@ -568,6 +569,8 @@ def test_names_that_a_skills_methods_use_are_its_own():
                     termination=lambda self, step: self.done(step),
                     timeout=1.0,
                     goal=(1.0, 2.0),
+                    far=2.0,
+                    _success=lambda self, step: step.terminated,
                 )
             ]
         )

@@ -230,23 +230,3 @@ def test_a_color_that_is_none_is_refused(color):
 @pytest.mark.parametrize("color", [(1, 2, 3), [255, 0, 0], np.array([1, 2, 3], np.uint8)], ids=str)
 def test_a_color_may_be_of_any_kind_of_row(color):
     assert declare(skills=[painted(color)]).skills[0].color is color
-
-
-def test_names_that_are_nearly_those_of_a_skill_are_told():
-    class Odd(Left):
-        max_step = 4
-        far = 2.0
-
-        def rewards(self, step):
-            return np.zeros(len(step.reward))
-
-        def _success(self, step):
-            return step.terminated
-
-    with pytest.warns(UserWarning, match="'odd'") as found:
-        declare(skills=[Odd()])
-    told = sorted(str(w.message).partition("has ")[2] for w in found)
-    assert [line.partition(",")[0] for line in told] == ["'max_step'", "'rewards'"]
-    meant = [line.rpartition(": is ")[2] for line in told]
-    assert meant[0] == "'max_steps' meant?"
-    assert meant[1].startswith("'reward' meant? (test_taken_over.py, line ")
