@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from ready_selectors.chain import DOOR, KEY, SPEC, GetKey, Leave, got_key
 from small_runs import ON, Heard, assert_same, messages, new_run, stopped_run
-from test_together import declare
+from together_runs import declare
 
 from skillweave import Automaton, SkillweaveError, Together
 from skillweave.envs.make import EnvSpec

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from small_runs import Heard, Left, Push, assert_same, new_run
-from test_together import Other, declare
+from together_runs import Other, declare
 
 from skillweave import SkillweaveError
 from skillweave._internal.prefixes import unprefixed

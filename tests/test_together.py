@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from declaring import plainly
 from small_runs import (
     MEMORY,
     OFF,
@@ -27,8 +26,9 @@ from small_runs import (
     reports_every,
     stage_entry,
 )
+from together_runs import Other, declare
 
-from skillweave import SAC, EnvSpec, Hierarchy, Lengths, Skill, SkillweaveError, Together
+from skillweave import SAC, EnvSpec, Lengths, Skill, SkillweaveError, Together
 from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.api.applying import differences
 from skillweave.evolution import Evolution, Mutations
@@ -41,23 +41,6 @@ from skillweave.training import agents
 from skillweave.training.episodes import Episodes
 from skillweave.training.skill_report import SkillReport
 from skillweave.training.stage_log import StageLog, success_rate
-
-
-def declare(*skills, **how):
-    options = {
-        "env": EnvSpec("CartPole-v1", engine="sync", workers=how.pop("workers", 1)),
-        "skills": skills or [Left(), Balance(), Push()],
-        "call_steps": 6,
-        "algorithm": ON,
-        "selector": ON,
-        "learn": "together",
-        "together_steps": 450,
-        "skill_steps": 150,
-        "selector_steps": 150,
-        "checkpoint_every": 75,
-    }
-    return Hierarchy(**plainly(options | how))
-
 
 CALLED = {"left": SkillReport(3, 3, {}, None, None), "push": SkillReport(9, 1, {}, None, None)}
 
@@ -76,12 +59,6 @@ def played_as(monkeypatch, returns_of):
 
 def alternately(obs):
     return np.where(obs[:, 0] > 0, "left", "push")
-
-
-class Other(Balance):
-    """Learns from replay."""
-
-    algorithm = OFF
 
 
 class Remembers(Left):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
+from off_policy_cases import B, P, critics, generators, line
 from torch.distributions import Categorical, Normal, TanhTransform, TransformedDistribution
 from toys import Masked, Toy, learn, transitions
 
@@ -21,7 +22,6 @@ from skillweave.errors import DeclarationError
 from skillweave.networks.config import Network
 from skillweave.ops.losses import critic_loss, masked_entropy_target
 
-P, B = 2, 6
 LINEAR = SAC(num_envs=2, network=Network(()), learning_rate=1e-2, normalize_obs=False)
 FORCES, CHOICES = Box(-1, 1, (2,)), Discrete(3)
 
@@ -35,20 +35,6 @@ def make(space, **settings) -> tuple[SACAlgorithm, State]:
         flat += 0.3 * torch.randn(flat.shape, generator=g)
     state.log_alpha = torch.tensor([[math.log(0.2)], [math.log(0.7)]])
     return algorithm, state
-
-
-def generators() -> list[torch.Generator]:
-    return [Seeds(9 + m).torch() for m in range(P)]
-
-
-def line(views, prefix: str, m: int, x: torch.Tensor) -> torch.Tensor:
-    return x @ views[f"{prefix}.0.weight"][m] + views[f"{prefix}.0.bias"][m, 0]
-
-
-def critics(algorithm: SACAlgorithm, flat: torch.Tensor, m: int, x: torch.Tensor) -> torch.Tensor:
-    """Both critics of a member, (2, B, out)."""
-    views = algorithm.critics.layout.views(flat[m])
-    return torch.stack([line(views, "critic", k, x) for k in range(2)])
 
 
 def squashed(head: torch.Tensor, g: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:

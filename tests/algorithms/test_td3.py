@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from gymnasium.spaces import Box
-from test_sac import generators
+from off_policy_cases import generators
 from toys import transitions
 
 from skillweave._internal.seeding import Seeds

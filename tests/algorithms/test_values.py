@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
-from test_sac import critics, line
+from off_policy_cases import critics, line
 from torch.distributions import Categorical
 
 from skillweave._internal.seeding import Seeds

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 from small_runs import interrupt_at_checkpoint
+from sweep_recipes import DYING_RECIPE, RECIPE
 
 from skillweave.cli import main, sweep
 from skillweave.cli.main import _with_addresses
@@ -14,23 +15,6 @@ from skillweave.errors import DeclarationError
 from skillweave.recipes import load, source
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import load_evaluation
-
-RECIPE = '''
-"""One skill on CartPole."""
-from skillweave import Apart, EnvSpec, Network, PPO, Hierarchy, Skill, TrainDefaults
-
-class Still(Skill):
-    def reward(self, step):
-        return -abs(step.next_obs[:, 1])
-
-small = PPO(num_envs=2, n_steps=16, batch_size=16, update_epochs=1, network=Network(hidden=(8,)))
-hierarchy = Hierarchy(
-    EnvSpec("CartPole-v1", engine="sync"), [Still()],
-    algorithm=small, selector=small, learn="apart",
-    apart=Apart(skill_steps=64, selector_steps=64),
-    train_defaults=TrainDefaults(checkpoint_every=32),
-)
-'''
 
 
 @pytest.fixture
@@ -193,20 +177,6 @@ def test_of_a_shipped_recipe_its_parts_count_and_nothing_else_of_the_library():
     found = code_files(source("mazes"))
     assert set(found) == {"", "skillweave.recipes._mazes", "skillweave.recipes._specs"}
     assert found[""] == source("mazes")
-
-
-DYING = """
-import os
-
-class Dying(Still):
-    def reward(self, step):
-        try:
-            os.close(os.open(__file__ + ".once", os.O_CREAT | os.O_EXCL))
-        except FileExistsError:
-            return super().reward(step)
-        os._exit(3)
-"""
-DYING_RECIPE = RECIPE.replace("\nsmall", f"{DYING}\nsmall", 1).replace("[Still()]", "[Dying()]")
 
 
 @pytest.mark.slow

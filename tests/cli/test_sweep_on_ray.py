@@ -5,7 +5,7 @@ import platform
 from importlib import metadata
 
 import pytest
-from test_sweep import DYING_RECIPE, RECIPE
+from sweep_recipes import DYING_RECIPE, RECIPE
 
 from skillweave.cli import main, sweep
 

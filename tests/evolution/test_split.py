@@ -14,8 +14,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from populations import assert_same_population
 from small_runs import interrupt_at_checkpoint
-from test_stage import assert_same_population
 
 from skillweave import DQN, PPO, Agent, EnvSpec, Network, SkillweaveError
 from skillweave._internal.seeding import Seeds

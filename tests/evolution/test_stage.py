@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_runs import assert_same
+from populations import assert_same_population
 
 from skillweave import (
     DQN,
@@ -120,12 +120,6 @@ def train(name: str, path: Path, evolution: Evolution | None = None, seed: int =
 
 def lineage(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (path / "lineage.jsonl").read_text().splitlines()]
-
-
-def assert_same_population(run: Path, reference: Path) -> None:
-    """The same members in all generations, policies and metrics."""
-    assert (run / "lineage.jsonl").read_text() == (reference / "lineage.jsonl").read_text()
-    assert_same(run, reference)
 
 
 @pytest.mark.fast_cases(1)

@@ -9,8 +9,8 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
+from joint_learners import Learner, Values
 from reference_calls import POSITION, T, Walk, one_step, scripted, seeds_of
-from test_joint import Learner, Values
 from toy_acting import Again, Choices, Counts, requests, valid_rows
 from toys import alone_in, calling_in
 

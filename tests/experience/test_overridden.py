@@ -6,9 +6,9 @@ import itertools
 
 import numpy as np
 import pytest
+from joint_learners import Down, Learner, N, Stay, Up, Values, asked
 from reference_calls import POSITION, Walk
-from test_joint import Choices, Down, Learner, N, Stay, Up, Values, asked
-from toy_acting import requests
+from toy_acting import Choices, requests
 from toys import alone_in, calling_in
 
 from skillweave._internal.seeding import Seeds
@@ -78,7 +78,7 @@ def test_rows_of_skills_that_learn_under_a_selector():
 
 
 def test_reflexes_are_in_force_while_skills_learn():
-    from test_together import declare
+    from together_runs import declare
 
     hierarchy = declare(reflexes=[BACK])
     (stage,) = hierarchy.stages()

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from random_hierarchies import traced_once
 from test_read import HIERARCHIES
-from test_state_machine import traced_once
 
 import skillweave as sw
 from skillweave.errors import SkillweaveError

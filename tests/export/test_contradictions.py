@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from random_hierarchies import Free, Remembers, critic_of, skill_set, traced_once, trained
 from skills.foreign_models import onnx_file
-from test_state_machine import Free, Remembers, critic_of, skill_set, traced_once, trained
 
 import skillweave as sw
 from skillweave.errors import PolicyError, RunError

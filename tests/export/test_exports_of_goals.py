@@ -12,7 +12,7 @@ import pytest
 import torch
 from goals.worlds import GoTo, Point, Rest, go_to, place_of
 from playing import alike, loaded_of, runner_of
-from test_networks import agent
+from random_networks import agent
 
 import skillweave as sw
 from skillweave.algorithms.agent_policy import AgentPolicy

@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from random_networks import NESTED, compare, one_by_one
 from skills.mapped_models import ACTION, SPACE, observations, one
-from test_networks import NESTED, compare, one_by_one
 
 import skillweave as sw
 from skillweave import from_onnx, from_torch

@@ -12,8 +12,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from random_networks import NESTED, agent, one_by_one
 from reference_calls import Counter, Left, Walk
-from test_networks import NESTED, agent, one_by_one
 
 from skillweave import PPO, EnvSpec, Hierarchy, Network, from_function
 from skillweave.api.player import Player

@@ -13,11 +13,7 @@ import pytest
 import torch
 from hub_server import go_to, serve
 from playing import loaded_of, runner_of
-from reference_calls import Left, Right, T, Zigzag, shy
-from skills.foreign_models import onnx_file
-from skills.mapped_models import ACTION, CASES, SPACE, observations, one, onnx_model, weights
-from test_networks import NESTED, agent, compare
-from test_state_machine import (
+from random_hierarchies import (
     AUTOMATON,
     POLICIES,
     Careful,
@@ -29,6 +25,10 @@ from test_state_machine import (
     traced_once,
     trained,
 )
+from random_networks import NESTED, agent, compare
+from reference_calls import Left, Right, T, Zigzag, shy
+from skills.foreign_models import onnx_file
+from skills.mapped_models import ACTION, CASES, SPACE, observations, one, onnx_model, weights
 
 import skillweave as sw
 from skillweave import DQN, PPO, Network

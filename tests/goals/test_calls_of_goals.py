@@ -4,29 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from goals.worlds import Rest, aim_of, declared, go_to, place_of
+from goals.worlds import Rest, declared, go_to, ready, walk
 
 import skillweave as sw
 from skillweave.errors import RunError
 from skillweave.hierarchy.repair import rehearsed_obs
 from skillweave.planning import CallLog, join
 from skillweave.skills.goals import goals_of
-
-
-def walk(self, obs, goal):
-    """Go to a goal that is a box, straight."""
-    return np.clip(5 * (aim_of(goal) - place_of(obs)), -1, 1).astype(np.float32)
-
-
-def rests(obs):
-    """A selector that never calls a skill with goals."""
-    return np.full(len(obs), "rest")
-
-
-def ready(space: str = "box", **how) -> sw.Run:
-    """A run of a ready skill with goals, and one without."""
-    skills = [go_to(space, policy=walk), Rest()]
-    return declared(skills, **({"selector": rests} | how)).train(quiet=True)
 
 
 def two_goals(obs):

@@ -5,14 +5,13 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
-from goals.test_calls_of_goals import ready
-from goals.worlds import Point, Rest, declared, go_to, place_of
-from planning.logs import log_of
+from goals.worlds import Point, Rest, declared, go_to, place_of, ready
+from planning.logs import jumps, log_of
 from planning.steps import assert_not_repeated, at
 
 import skillweave as sw
 from skillweave.errors import DeclarationError, RunError, SkillError
-from skillweave.planning import CallLog, Explorer, Mission, Planner, Predicate
+from skillweave.planning import Explorer, Mission, Planner, Predicate
 from skillweave.planning.graph import CallGraph
 from skillweave.skills.goal_spaces import choice_space
 
@@ -30,19 +29,6 @@ def near(*place: float) -> Predicate:
 
 
 MISSION = Mission(near(1.4, 0.3), near(0.3, 1.4))
-
-
-def jumps(goals, starts=range(11)) -> CallLog:
-    """A log of one skill with goals: from each start it goes three steps towards each goal."""
-    calls, given = [], []
-    for start in starts:
-        for goal in goals:
-            inside = np.clip(np.arange(1, 4) * np.sign(goal - start), *sorted((0, goal - start)))
-            calls.append((start, [(0, (start + inside).tolist(), True, "limit")]))
-            given.append([goal])
-    log = log_of(["go"], calls)
-    log.goals["go"] = np.array(given, np.float64)
-    return log
 
 
 def bound(planner: Planner, space) -> Planner:

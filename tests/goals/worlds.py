@@ -135,3 +135,19 @@ def declared(skills=None, env=Point, **how) -> sw.Hierarchy:
     # By default the number of processes depends on the time that a step takes, and so do weights.
     spec = env if isinstance(env, sw.EnvSpec) else sw.EnvSpec(env, workers=1)
     return sw.Hierarchy(spec, [go_to()] if skills is None else skills, **(defaults | how))
+
+
+def walk(self, obs, goal):
+    """Go to a goal that is a box, straight."""
+    return np.clip(5 * (aim_of(goal) - place_of(obs)), -1, 1).astype(np.float32)
+
+
+def rests(obs):
+    """A selector that never calls a skill with goals."""
+    return np.full(len(obs), "rest")
+
+
+def ready(space: str = "box", **how) -> sw.Run:
+    """A run of a ready skill with goals, and one without."""
+    skills = [go_to(space, policy=walk), Rest()]
+    return declared(skills, **({"selector": rests} | how)).train(quiet=True)

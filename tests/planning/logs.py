@@ -57,3 +57,16 @@ def log_of(
         reward=np.zeros(len(inside), np.float32) if rewards is None else np.float32(rewards),
         limits=tuple(limits),
     )
+
+
+def jumps(goals, starts=range(11)) -> CallLog:
+    """A log of one skill with goals: from each start it goes three steps towards each goal."""
+    calls, given = [], []
+    for start in starts:
+        for goal in goals:
+            inside = np.clip(np.arange(1, 4) * np.sign(goal - start), *sorted((0, goal - start)))
+            calls.append((start, [(0, (start + inside).tolist(), True, "limit")]))
+            given.append([goal])
+    log = log_of(["go"], calls)
+    log.goals["go"] = np.array(given, np.float64)
+    return log

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from goals.test_plans_of_goals import jumps
-from planning.logs import log_of
+from planning.logs import jumps, log_of
 from planning.steps import at
 
 from skillweave.planning import (
