@@ -46,7 +46,7 @@ def skills(sees: Any) -> Any:
     return [Arm(), type("Hook", (Hook,), {"sees": sees})()]
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(
     "sees",
     [
@@ -75,7 +75,8 @@ def middle(obs: Any) -> Any:
     return np.concatenate([-0.5 * obs["arm"], -0.25 * obs["hook"]], axis=1)
 
 
-@pytest.mark.parametrize("name", ["every", "module"])
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("name", ["module", "every"])
 def test_corrections(name, tmp_path):
     torch.manual_seed(0)
     base = {
