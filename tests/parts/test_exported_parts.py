@@ -171,7 +171,7 @@ def louder(policy: Any) -> Any:
     return HierarchyPolicy(louder(policy.selector), below, None, policy.goals)
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("case", WITH_GOALS)
 def test_skills_with_goals_and_parts(case: str, tmp_path: Any) -> None:
     selector, rest, make = WITH_GOALS[case]
@@ -201,6 +201,7 @@ def test_a_plan_of_skills_with_goals_and_parts(tmp_path: Any) -> None:
     assert len(goals) > 5
 
 
+@pytest.mark.slow
 def test_a_hierarchy_that_a_skill_corrects(tmp_path):
     skill = type("Better", (sw.Skill,), {"policy": sw.Residual(greedy().policy)})()
     exported(greedy([skill]), tmp_path / "out")
