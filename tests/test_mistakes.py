@@ -20,6 +20,7 @@ import pytest
 import torch
 from goals import worlds as goals
 from parts import crane
+from ready_selectors.chain import bound
 from safetensors.torch import load_file
 from toys import World
 
@@ -694,6 +695,14 @@ def middle(obs: Any) -> Any:
     return np.concatenate([-0.5 * obs["arm"], -0.25 * obs["hook"]], axis=1)
 
 
+def ended(step: Any) -> Any:
+    return step.terminated
+
+
+def automaton(transitions: Any) -> Any:
+    return sw.Automaton({"a": "wait", "b": "leave"}, transitions)
+
+
 TWO = {"at": np.zeros((1, 2)), "side": np.zeros(1, int)}
 WIDE = {"skill": [0, 0], "goal": {GO: np.zeros((2, 3))}}
 IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
@@ -807,6 +816,25 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
         "the action has 3",
     ),
     ("DeclarationError", lambda: cranes(skill(policy=sw.Residual(5))), "is 5, which cannot act"),
+    # Ready selectors
+    ("DeclarationError", lambda: sw.Automaton({}, {}), "give at least one"),
+    ("DeclarationError", lambda: sw.Automaton({"a": []}, {}), "'a' has no skill"),
+    ("DeclarationError", lambda: sw.Automaton({"a": 3}, {}), "state 'a' has 3"),
+    ("DeclarationError", lambda: sw.Automaton({"a": [3]}, {}), "has 3 among its"),
+    ("DeclarationError", lambda: sw.Automaton({3: "wait"}, {}), "state is 3"),
+    ("DeclarationError", lambda: sw.Automaton({"a": "b"}, {}, "x"), "names the state 'x'"),
+    ("DeclarationError", lambda: automaton({("a", "c"): ended}), "names the state 'c'"),
+    ("DeclarationError", lambda: automaton({"a": ended}), "from 'a'; write"),
+    ("DeclarationError", lambda: automaton([ended]), "transitions are"),
+    ("DeclarationError", lambda: automaton({("a", "b"): "won"}), "has the event 'won'"),
+    ("DeclarationError", lambda: bound(sw.Automaton({"a": "fly"}, {})), "state 'a' names 'fly'"),
+    ("DeclarationError", lambda: sw.tree.Sequence(), "Sequence has no children"),
+    ("DeclarationError", lambda: sw.tree.Fallback("a", 3), "has the child 3"),
+    ("DeclarationError", lambda: sw.tree.Sequence(sw.tree.Fallback), "has the child <class"),
+    ("DeclarationError", lambda: sw.tree.Sequence("a", memory=1), "memory is 1"),
+    ("DeclarationError", lambda: bound(sw.tree.Sequence(ended)), "tree has no skill"),
+    ("DeclarationError", lambda: sw.tree.Condition("a"), "Condition is 'a'"),
+    ("DeclarationError", lambda: bound(sw.tree.Sequence("fly")), "leaf names 'fly'"),
     # One argument alone
     (
         "DeclarationError",

@@ -34,7 +34,7 @@ def far(inner, space: str = "box", **attributes) -> sw.Skill:
     return type("Far", (GoTo,), methods | attributes)()
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(
     ("learn", "space"),
     [("together", "box"), ("apart", "number"), ("apart, then together", "dict"), ("apart", "box")],

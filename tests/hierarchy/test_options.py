@@ -89,24 +89,6 @@ def test_choosing_a_skill_that_may_not_start_names_it_and_the_environment(option
         env.step(np.ones(N, int))
 
 
-def test_where_no_skill_may_start_the_error_names_them_all(options):
-    class Early(Left):
-        def initiation(self, obs):
-            return obs[:, T] < 3
-
-    class Never(Left):
-        def initiation(self, obs):
-            return np.zeros(len(obs), bool)
-
-    env = options(skill_set(Early, Never, call_steps=1))
-    _, info = env.reset(seed=6)
-    for _ in range(2):
-        *_, info = env.step(np.zeros(N, int))
-        assert info["action_mask"].tolist() == [[True, False]] * N
-    with pytest.raises(SkillweaveError, match=r"no skill may start .*'early', 'never'"):
-        env.step(np.zeros(N, int))
-
-
 @pytest.mark.parametrize("bad", [4, 17, -1])
 def test_an_action_that_is_no_skill_is_named(options, bad):
     env = options(skill_set(*ALL))
@@ -115,19 +97,6 @@ def test_an_action_that_is_no_skill_is_named(options, bad):
     choice[2] = bad
     with pytest.raises(SkillweaveError, match=rf"action {bad} .*there are 4"):
         env.step(choice)
-
-
-@pytest.mark.parametrize("method", ["initiation", "termination"])
-def test_a_wrong_shape_names_the_skill_and_the_method(options, method):
-    wrong = type("Wrong", (Left,), {method: lambda self, x: True})
-    env = options(skill_set(wrong))
-
-    def play():
-        env.reset(seed=0)
-        env.step(np.zeros(N, int))
-
-    with pytest.raises(SkillError, match=rf"'wrong'.*{method}\(\).*shape"):
-        play()
 
 
 # Stochastic skills ---------------------------------------------------------------------------

@@ -46,7 +46,7 @@ def skills(sees: Any) -> Any:
     return [Arm(), type("Hook", (Hook,), {"sees": sees})()]
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(
     "sees",
     [
@@ -75,7 +75,8 @@ def middle(obs: Any) -> Any:
     return np.concatenate([-0.5 * obs["arm"], -0.25 * obs["hook"]], axis=1)
 
 
-@pytest.mark.parametrize("name", ["every", "module"])
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("name", ["module", "every"])
 def test_corrections(name, tmp_path):
     torch.manual_seed(0)
     base = {
@@ -170,7 +171,7 @@ def louder(policy: Any) -> Any:
     return HierarchyPolicy(louder(policy.selector), below, None, policy.goals)
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("case", WITH_GOALS)
 def test_skills_with_goals_and_parts(case: str, tmp_path: Any) -> None:
     selector, rest, make = WITH_GOALS[case]
@@ -200,6 +201,7 @@ def test_a_plan_of_skills_with_goals_and_parts(tmp_path: Any) -> None:
     assert len(goals) > 5
 
 
+@pytest.mark.slow
 def test_a_hierarchy_that_a_skill_corrects(tmp_path):
     skill = type("Better", (sw.Skill,), {"policy": sw.Residual(greedy().policy)})()
     exported(greedy([skill]), tmp_path / "out")

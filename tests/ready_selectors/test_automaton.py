@@ -45,37 +45,6 @@ def test_an_automaton_whose_skills_may_not_start_says_so():
     assert story(policy, 0)[0] == ("wait", 2)
 
 
-WRONG = {
-    "no states": (lambda: Automaton({}, {}), "give at least one"),
-    "a state without a skill": (lambda: Automaton({"a": []}, {}), "state 'a' has no skill"),
-    "a number as a skill": (lambda: Automaton({"a": 3}, {}), "state 'a' has 3; give a skill's"),
-    "a number among skills": (lambda: Automaton({"a": [3]}, {}), "state 'a' has 3 among its"),
-    "a state's name": (lambda: Automaton({3: "wait"}, {}), "state is 3; it must be a text"),
-    "the start": (lambda: Automaton(STATES, {}, "begin"), "start names the state 'begin'.*search"),
-    "to an unknown state": (
-        lambda: Automaton(STATES, {("search", "fre"): got_key}),
-        r"\('search', 'fre'\) names the state 'fre', which does not exist; the states are: search",
-    ),
-    "no pair": (lambda: Automaton(STATES, {"search": got_key}), "from 'search'; write"),
-    "transitions as a list": (lambda: Automaton(STATES, [got_key]), "transitions are"),
-    "an unknown event": (
-        lambda: Automaton(STATES, {("search", "free"): "won"}),
-        "has the event 'won'; give a function of a Step, 'success' or 'failure'",
-    ),
-    "an unknown skill": (
-        lambda: bound(Automaton({"a": "walk"}, {})),
-        "state 'a' names 'walk'.*its skills are: get_key, open_door",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_automaton_is_refused(case):
-    make, message = WRONG[case]
-    with pytest.raises(DeclarationError, match=message):
-        make()
-
-
 def test_an_event_that_answers_wrongly_is_named():
     def won(step: Step) -> Any:
         return step.next_obs

@@ -11,7 +11,7 @@ from planning.steps import watched
 from ready_selectors.chain import Corridor, has_key, hierarchy, story
 
 from skillweave import tree
-from skillweave.errors import DeclarationError, SkillError
+from skillweave.errors import SkillError
 from skillweave.policies.core import CallEnd
 from skillweave.skills import LastCall
 from skillweave.skills.selector import TreeSelector, ready_selector
@@ -70,27 +70,6 @@ def test_a_tree_that_ends_without_a_skill_says_where():
         choose(tree.Fallback(flag(0), "a"), (1, 0, 0))
     with pytest.raises(SkillError, match="without a skill that may start"):
         choose(tree.Sequence("a", "b"), mask=(False, True, True))
-
-
-WRONG = {
-    "no children": (lambda: tree.Sequence(), "Sequence has no children"),
-    "a number as a child": (lambda: tree.Fallback("a", 3), "Fallback has the child 3"),
-    "a class as a child": (lambda: tree.Sequence(tree.Fallback), "has the child <class"),
-    "memory": (lambda: tree.Sequence("a", memory=1), "memory is 1"),
-    "no skill": (lambda: made(tree.Sequence(flag(0))), "tree has no skill"),
-    "no function": (lambda: tree.Condition("a"), "Condition is 'a'.*function of observations"),
-    "an unknown skill": (
-        lambda: made(tree.Sequence("a", tree.Fallback("d"))),
-        "leaf names 'd'.*its skills are: a, b, c",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_tree_is_refused(case):
-    make, message = WRONG[case]
-    with pytest.raises(DeclarationError, match=message):
-        make()
 
 
 def test_a_condition_that_answers_wrongly_is_named():

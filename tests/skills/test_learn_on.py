@@ -156,14 +156,6 @@ def test_a_sequential_module():
     np.testing.assert_allclose(agent.act({}, obs)[0], wanted, atol=1e-5)
 
 
-def test_a_network_of_other_sizes_is_named_with_them(tmp_path):
-    policy = sw.from_torch(torch.nn.Sequential(torch.nn.Linear(5, 2)), learn=True)
-    with pytest.raises(
-        PolicyError, match=r"networks \(actor 5 to 2\) .* values than Box.* and Box"
-    ):
-        hierarchy(skill(policy)).train(tmp_path / "run", quiet=True)
-
-
 def skill(policy, **fields):
     return type("Walk", (sw.Skill,), {"policy": policy, **fields})()
 
@@ -234,95 +226,91 @@ def test_a_plain_agent_starts_from_it(tmp_path):
         )
 
 
-class TestRefused:
-    def test_another_algorithm(self, tmp_path):
-        walk = skill(sw.from_sb3(model_of("SAC", World()), learn=True))
-        with pytest.raises(DeclarationError, match=r"'walk'.*SAC learns on by SAC.*is PPO"):
-            hierarchy(walk).train(tmp_path / "run", quiet=True)
+def test_other_goals_are_refused(tmp_path):
+    reach, place = gym.spaces.Box(-1, 1, (1,), np.float32), World().observation_space
+    seen = gym.spaces.Dict([("observation", place), ("goal", reach)])
+    model = sb3.PPO("MultiInputPolicy", World(seen), device="cpu")
+    module = torch.nn.Sequential(torch.nn.Linear(4, 2))
+    for policy in (
+        sw.from_sb3(model, learn=True),
+        sw.from_torch(module, observation_space=seen, learn=True),
+    ):
 
-    def test_other_spaces(self, tmp_path):
-        env = World(gym.spaces.Box(-2, 2, (5,), np.float32))
-        walk = skill(sw.from_sb3(model_of("PPO", env), learn=True))
-        with pytest.raises(PolicyError, match=r"'walk'.*observation_space"):
-            hierarchy(walk).train(tmp_path / "run", quiet=True)
+        def goes(high, policy=policy):
+            wide = gym.spaces.Box(-high, high, (1,), np.float32)
 
-    def test_other_goals(self, tmp_path):
-        reach, place = gym.spaces.Box(-1, 1, (1,), np.float32), World().observation_space
-        seen = gym.spaces.Dict([("observation", place), ("goal", reach)])
-        model = sb3.PPO("MultiInputPolicy", World(seen), device="cpu")
-        module = torch.nn.Sequential(torch.nn.Linear(4, 2))
-        for policy in (
-            sw.from_sb3(model, learn=True),
-            sw.from_torch(module, observation_space=seen, learn=True),
-        ):
+            def reward(self, step):
+                return step.goal[:, 0]
 
-            def goes(high, policy=policy):
-                wide = gym.spaces.Box(-high, high, (1,), np.float32)
+            return skill(policy, goal_space=wide, reward=reward, steps=16)
 
-                def reward(self, step):
-                    return step.goal[:, 0]
+        for how in ({}, {"start_from": {"walk": policy}}):
+            walk = goes(3.0, None if how else policy)
+            with pytest.raises(PolicyError, match=r"'walk': .*was trained for goals of Box\(-1"):
+                hierarchy(walk).train(tmp_path / "run", quiet=True, **how)
+    run = hierarchy(goes(1.0), learn="apart", steps=32).train(tmp_path / "run", quiet=True)
+    assert "walk" in run.info()["stages"][0]["starts"]
 
-                return skill(policy, goal_space=wide, reward=reward, steps=16)
 
-            says = r"was trained for goals of Box\(-1.*but now its goal_space is Box\(-3"
-            with pytest.raises(PolicyError, match=f"skill 'walk': .*{says}"):
-                hierarchy(goes(3.0)).train(tmp_path / "run", quiet=True)
-            with pytest.raises(PolicyError, match=f"start_from: 'walk': .*{says}"):
-                hierarchy(goes(3.0, None)).train(
-                    tmp_path / "run", quiet=True, start_from={"walk": policy}
-                )
-        run = hierarchy(goes(1.0), learn="apart", steps=32).train(tmp_path / "run", quiet=True)
-        assert "walk" in run.info()["stages"][0]["starts"]
+def learning(policy, **how):
+    return hierarchy(skill(policy, **how)).train(quiet=True)
 
-    def test_a_module_of_another_size(self, tmp_path):
-        walk = skill(sw.from_torch(torch.nn.Linear(5, 2), learn=True))
-        with pytest.raises(PolicyError, match="does not fit 'walk'"):
-            hierarchy(walk).train(tmp_path / "run", quiet=True)
 
-    @pytest.mark.parametrize(
-        "module",
-        [
-            torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Dropout(), torch.nn.Linear(4, 2)),
-            torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Linear(4, 2)),
-            torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.Tanh()),
-            torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.ELU(5.0), torch.nn.Linear(4, 2)),
-        ],
-        ids=lambda m: type(m).__name__,
-    )
-    def test_a_module_of_other_layers(self, module):
-        with pytest.raises(PolicyError, match="cannot learn on"):
-            sw.from_torch(module, learn=True)
+def with_nan():
+    module = torch.nn.Linear(3, 2)
+    module.weight.data[0, 0] = float("nan")
+    return module
 
-    def test_a_mapping(self):
-        model = model_of("PPO", World())
-        with pytest.raises(DeclarationError, match=r"leave out sees and every.*class"):
-            sw.from_sb3(model, sees=(0, 1, 2), every=2, learn=True)
-        with pytest.raises(DeclarationError, match=r"leave out sees.*class"):
-            sw.from_torch(torch.nn.Linear(3, 2), every=2, learn=True)
 
-    def test_images_and_gsde(self):
-        space = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
-        images = sb3.PPO("CnnPolicy", World(space, DISCRETE), device="cpu")
-        with pytest.raises(PolicyError, match=r"cannot learn on.*NatureCNN"):
-            sw.from_sb3(images, learn=True)
-        with pytest.raises(PolicyError, match="gSDE"):
-            sw.from_sb3(model_of("PPO", World(), use_sde=True), learn=True)
+def of(*layers):
+    return torch.nn.Sequential(torch.nn.Linear(3, 4), *layers)
 
-    def test_numbers_that_are_not_finite(self):
-        module = torch.nn.Linear(3, 2)
-        module.weight.data[0, 0] = float("nan")
-        with pytest.raises(PolicyError, match="NaN"):
-            sw.from_torch(module, learn=True)
 
-    def test_a_zip_without_trust_repeats_what_was_asked(self, tmp_path):
-        model_of("PPO", World()).save(tmp_path / "m.zip")
-        with pytest.raises(PolicyError, match=r"\"?'?ppo'?\"?, trust=True, learn=True\)"):
-            sw.from_sb3(tmp_path / "m.zip", learn=True)
-        with pytest.raises(RunError, match="does not exist"):
-            sw.from_sb3(tmp_path / "other.zip", learn=True)
+FIVE, PIXELS = (
+    gym.spaces.Box(-2, 2, (5,), np.float32),
+    gym.spaces.Box(0, 255, (36, 36, 3), np.uint8),
+)
+REFUSED = [
+    (lambda: learning(by_sb3("SAC")), "SAC learns on by SAC"),
+    (lambda: learning(by_sb3("PPO", World(FIVE))), "'walk'.*observation_space"),
+    (lambda: learning(by_torch(torch.nn.Linear(5, 2))), "does not fit 'walk'"),
+    (lambda: learning(by_torch(torch.nn.Sequential(torch.nn.Linear(5, 2)))), "actor 5 to 2"),
+    (lambda: by_torch(of(torch.nn.Dropout(), torch.nn.Linear(4, 2))), "cannot learn on"),
+    (lambda: by_torch(of(torch.nn.Linear(4, 2))), "cannot learn on"),
+    (lambda: by_torch(of(torch.nn.Tanh())), "cannot learn on"),
+    (lambda: by_torch(of(torch.nn.ELU(5.0), torch.nn.Linear(4, 2))), "cannot learn on"),
+    (lambda: by_sb3("PPO", sees=(0, 1, 2), every=2), "leave out sees and every"),
+    (lambda: by_torch(torch.nn.Linear(3, 2), every=2), "leave out sees"),
+    (
+        lambda: sw.from_sb3(
+            sb3.PPO("CnnPolicy", World(PIXELS, DISCRETE), device="cpu"), learn=True
+        ),
+        "cannot learn on.*NatureCNN",
+    ),
+    (lambda: sw.from_sb3(model_of("PPO", World(), use_sde=True), learn=True), "gSDE"),
+    (lambda: by_torch(with_nan()), "NaN"),
+    (lambda: by_sb3("PPO", learn="yes"), "learn is 'yes'"),
+    (lambda: by_torch(torch.nn.Linear(3, 2), learn=1), "learn is 1"),
+]
 
-    def test_another_word_for_learn(self):
-        with pytest.raises(DeclarationError, match="learn is 'yes'"):
-            sw.from_sb3(model_of("PPO", World()), learn="yes")
-        with pytest.raises(DeclarationError, match="learn is 1"):
-            sw.from_torch(torch.nn.Linear(3, 2), learn=1)
+
+def by_sb3(kind, env=None, **how):
+    return sw.from_sb3(model_of(kind, env or World()), **{"learn": True} | how)
+
+
+def by_torch(module, **how):
+    return sw.from_torch(module, **{"learn": True} | how)
+
+
+@pytest.mark.parametrize(("make", "says"), REFUSED, ids=[says for _, says in REFUSED])
+def test_what_cannot_learn_on_is_refused(make, says):
+    with pytest.raises((DeclarationError, PolicyError), match=says):
+        make()
+
+
+def test_a_zip_without_trust_repeats_what_was_asked(tmp_path):
+    model_of("PPO", World()).save(tmp_path / "m.zip")
+    with pytest.raises(PolicyError, match=r"ppo.*trust=True, learn=True"):
+        sw.from_sb3(tmp_path / "m.zip", learn=True)
+    with pytest.raises(RunError, match="does not exist"):
+        sw.from_sb3(tmp_path / "other.zip", learn=True)
