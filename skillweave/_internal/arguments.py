@@ -45,8 +45,11 @@ def checked_names(target: T) -> T:
 
 
 def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function whose wrong arguments raise a DeclarationError with a hint."""
+
     @functools.wraps(function)
     def checked(*args: Any, **named: Any) -> Any:
+        """Call the function; explain a TypeError where its arguments do not fit."""
         try:
             with usual_floats():
                 return function(*args, **named)

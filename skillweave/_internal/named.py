@@ -85,6 +85,7 @@ def _known(name: str, function: Callable[..., Any]) -> Named:
 
 
 def _name_of(function: Any, where: str) -> str:
+    """Return the name by which files record a user's function, with its bound arguments."""
     values: dict[str, Any] = {}
     inner = function
     if isinstance(function, functools.partial):

@@ -217,6 +217,7 @@ def _padded(x: Array, more: int) -> Array:
 
 
 def _joined(parts: list[Array | None], members: int, name: str) -> Array:
+    """Return one column of a batch, joined of the same column of several batches."""
     described = column(name)
     axis = 0 if described.per_env else 1
     example = next(part for part in parts if part is not None)

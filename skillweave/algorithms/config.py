@@ -511,6 +511,7 @@ def registration_of(config: Any) -> Registration:
 
 
 def _not_registered(name: str) -> str:
+    """Return the error message for settings of an algorithm that is not registered."""
     return (
         f"no algorithm is registered for {name}; there are: {', '.join(_REGISTERED)}. An algorithm "
         "of your own must be registered in every process that uses it, before it is used: call "

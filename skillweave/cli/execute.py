@@ -52,6 +52,7 @@ def run(command: commands.Output) -> Result:
 
 
 def _evaluate(command: commands.EvaluateCommand) -> Result:
+    """Carry out ``skillweave evaluate``."""
     trained = _load_target(command)
     score = trained.evaluate(
         command.episodes,
@@ -82,6 +83,7 @@ def _goal(command: commands.Watched) -> Any:
 
 
 def _render(command: commands.RenderCommand) -> Result:
+    """Carry out ``skillweave render``."""
     trained = _load_target(command)
     path = command.out or Path(f"{Path(command.target).name.removesuffix('.safetensors')}.gif")
     result = trained.render(
@@ -98,6 +100,7 @@ def _render(command: commands.RenderCommand) -> Result:
 
 
 def _log(command: commands.LogCommand) -> Result:
+    """Carry out ``skillweave log``: record calls of a run's skills."""
     run = _load_with_code(command.run, command.recipe)
     if words := lacking_features(run.hierarchy, run.policy):
         notice(words)
@@ -118,6 +121,7 @@ def _log(command: commands.LogCommand) -> Result:
 
 
 def _plan(command: commands.PlanCommand) -> Result:
+    """Carry out ``skillweave plan``: plan a mission on a run's recorded calls."""
     path = Path(command.target)
     if path.is_dir() and not command.pretrained:
         run = _load_with_code(path, command.recipe)
@@ -145,6 +149,7 @@ def _plan(command: commands.PlanCommand) -> Result:
 
 
 def _plot(command: commands.PlotCommand) -> Result:
+    """Carry out ``skillweave plot``: figures of one run or of several."""
     runs = open_runs(command.runs)
     of_several = (command.metric, command.agent, *command.label)
     if len(runs) == 1 and all(word is None for word in of_several) and command.band == "iqr":
@@ -169,6 +174,7 @@ def _plot(command: commands.PlotCommand) -> Result:
 
 
 def _report(command: commands.ReportCommand) -> Result:
+    """Carry out ``skillweave report``: the HTML report of a run."""
     run = RunDirectory.open(command.run)
     why_not = None
     trained = None
@@ -207,6 +213,7 @@ def _about(page: dict[str, Any]) -> Result:
 
 
 def _list(command: commands.ListCommand) -> Result:
+    """Carry out ``skillweave list``: the shipped recipes, and the runs here."""
     shipped = []
     for name in recipes.names():
         weights = (recipes.source(name).with_suffix(".safetensors")).exists()
@@ -224,6 +231,7 @@ def _list(command: commands.ListCommand) -> Result:
 
 
 def _run_line(path: Path) -> dict[str, Any]:
+    """Return the entry of a run in the output of ``skillweave list``."""
     try:
         run = RunDirectory.open(path)
     except RunError as error:
@@ -235,6 +243,7 @@ def _run_line(path: Path) -> dict[str, Any]:
 
 
 def _info(command: commands.InfoCommand) -> Result:
+    """Carry out ``skillweave info``: a recipe's settings, or a run's content."""
     if not (Path(command.target) / "run.json").exists() and not Path(command.target).is_dir():
         settings = list_settings(recipes.load(command.target))
         text = "\n".join(f"{k}={v}" for k, v in settings.items())
@@ -317,6 +326,7 @@ def _weights(command: commands.WeightsCommand) -> Result:
 
 
 def _export(command: commands.ExportCommand) -> Result:
+    """Carry out ``skillweave export``."""
     if not command.onnx:
         raise DeclarationError("choose an export format: --onnx")
     name = Path(command.target).name.removesuffix(".safetensors")
@@ -326,6 +336,7 @@ def _export(command: commands.ExportCommand) -> Result:
 
 
 def _push(command: commands.PushCommand) -> Result:
+    """Carry out ``skillweave push``: upload a run to the hub."""
     _no_bars()
     pushed = push_run(command.run, command.name, command.private, command.calls)
     lines = [f"{pushed['url']}: {len(pushed['files'])} files", *pushed["missing"]]
@@ -357,6 +368,7 @@ def _no_bars() -> None:
 
 
 def _import_agilerl(command: commands.ImportAgilerlCommand) -> Result:
+    """Carry out ``skillweave import-agilerl``: convert a checkpoint of AgileRL."""
     if not command.trust:
         raise DeclarationError(
             f"{command.file} would be read as a pickle, and pickles can run code. This one is read "

@@ -45,6 +45,7 @@ class Processes:
         return self._threads.submit(self._run, job, arguments)
 
     def _run(self, job: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        """Run a job in a fresh process, and return its result."""
         receiver, sender = _START.Pipe(duplex=False)
         child = _START.Process(target=_answer, args=(sender, job, arguments))
         with self._lock:

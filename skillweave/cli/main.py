@@ -70,6 +70,7 @@ def _with_json(words: Sequence[str], stream: Any, alone: bool) -> int:
 
 
 def _main(words: Sequence[str], put: Put, alone: bool) -> int:
+    """Parse the words of a command line, carry out the command, return its exit code."""
     if list(words) == ["--version"]:
         from skillweave import __version__
 
@@ -154,6 +155,7 @@ def _with_addresses(words: Sequence[str]) -> list[str]:
 
 
 def _fail(words: Sequence[str], put: Put, message: str, code: int) -> int:
+    """Print the error of a command, as JSON too if it is wanted; return the exit code."""
     if "--json" in words:
         with suppress(RunError):  # it is printed below as well
             put(as_json({"error": message}))

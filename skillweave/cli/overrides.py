@@ -224,6 +224,7 @@ def _evolution(settings: Changes) -> Evolution:
 
 
 def _range(written: str, text: str) -> Range:
+    """Return the range that ``--evolve`` sets for a setting: low,high or low,high,scale."""
     try:
         low, high, *scale = (part.strip() for part in text.split(","))
         return Range(float(low), float(high), *scale)  # type: ignore[arg-type]
@@ -297,6 +298,7 @@ def _parse(name: str, text: str, hint: Any) -> Any:
 
 
 def _unknown(name: str, known: Sequence[str]) -> DeclarationError:
+    """Return the error for a name that ``--set`` or ``--evolve`` does not have."""
     last = ELSEWHERE.get(name, name)
     longer = [k for k in known if k.rpartition(".")[2] == last != k]
     if longer and name not in known:

@@ -264,6 +264,7 @@ def _task() -> Callable[..., Any]:
     place = actor_class()()
 
     def task(job: tuple[Any, ...], code: bytes, good: Sequence[tuple[str, str]]) -> Any:
+        """Train one run of a sweep on a node of Ray; return its versions and the result."""
         versions = place.versions()
         if (versions["Skillweave"], versions["Python"]) not in good:
             return versions, None
@@ -305,6 +306,7 @@ def summary(results: Sequence[tuple[Job, float | str]], out: Path) -> Result:
 
 
 def _table(groups: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the lines of the table that ``sweep`` prints."""
     wide = max(len(g["settings"]) for g in groups)
     head = f"{'settings':<{wide}} {'runs':>5} {'return':>9} {'95 % interval':>20} {'median':>9}"
     lines = [f"{head} {'least to most':>20}"]

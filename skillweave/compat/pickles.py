@@ -211,6 +211,7 @@ class _Unpickler(pickle.Unpickler):
         self._inert = type("Inert", (Inert,), {})
 
     def find_class(self, module: str, name: str) -> Any:
+        """Return what a pickle names, if it is allowed: a tensor, a number, a plain container."""
         module = module.replace("numpy._core", "numpy.core")
         if module == "torch" and name in _STORAGES:
             return _STORAGES[name]
@@ -223,6 +224,7 @@ class _Unpickler(pickle.Unpickler):
         return self._inert if allowed is Inert else _Call(allowed)
 
     def persistent_load(self, pid: Any) -> _Held:
+        """Return a tensor's storage that the pickle of a checkpoint refers to."""
         kind, dtype, key, _, size = pid
         if kind != "storage" or not isinstance(dtype, torch.dtype) or not isinstance(key, str):
             raise RunError(f"refused: the pickle refers to {shown(pid)}")
@@ -273,6 +275,7 @@ class _Array(np.ndarray[Any, Any]):
 
 
 def _create_array(make: Any, arguments: Any, state: Any, *_: Any) -> Any:
+    """Return a NumPy array as dill writes it into a pickle."""
     if not isinstance(make, _Call) or make._function is not _Array:  # dill writes arrays so
         raise RunError(f"refused: the pickle makes an array by {shown(make)}")
     array = _Array(*arguments)

@@ -200,6 +200,7 @@ class EnvSpec:
     def _from_registry(
         self, env_id: str, render_mode: str | None, kwargs: dict[str, Any]
     ) -> gym.Env[Any, Any]:
+        """Make an environment by its Gymnasium id; an error names what is not installed."""
         try:
             try:
                 return gym.make(env_id, render_mode=render_mode, **kwargs)

@@ -116,6 +116,7 @@ def _examples(policy: Mapped, space: gym.Space[Any]) -> dict[str, Tensor]:
 
 
 def _module_model(policy: Mapped, own: TorchPolicy, where: str) -> Mapped:
+    """Return the model of a PyTorch module as an ONNX file, with its mapping."""
     space = own.observation_space
     given = _examples(policy, space)
     shapes = [tuple(1 if n is None else n for n in shape) for shape in own.mapping.state]
@@ -162,6 +163,7 @@ def _channels_first(x: Tensor, space: gym.Space[Any]) -> Tensor:
 
 
 def _sb3_model(policy: Mapped, own: SB3Policy, where: str) -> Mapped:
+    """Return the model of Stable-Baselines3 as an ONNX file, with its mapping."""
     space = own.observation_space
     given = _examples(policy, space)
     names = list(policy.inputs or ()) or [name.removeprefix(f"{OBS}.") for name in given]

@@ -149,6 +149,7 @@ def _row(head: ActionHead | JointHead, action: Tensor) -> Tensor:
 
 
 def _in_env_units(codec: ActionCodec, action: Tensor, squash: bool) -> Tensor:
+    """Convert a policy's action, inside an ONNX graph, to the units of the environment."""
     space = codec.space
     shape = (1, *(space.shape or ()))
     dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype

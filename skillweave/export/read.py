@@ -168,6 +168,7 @@ def _skill_set(deployed: Deployed) -> SkillSet:
 
 
 def _policy(skill: CalledSkill, deployed: Deployed) -> Policy:
+    """Return the policy of a skill that was exported, to act or to be a skill again."""
     inside = Deployed(skill.policy, deployed.sees, deployed.acts)
     if isinstance(innermost(skill.policy), CallAndReturn):
         return ExportedHierarchy(inside, "")

@@ -155,6 +155,7 @@ def eager(skill: Skill, holds: Callable[[Step], Array], bonus: float, rest: floa
     """
 
     def reward(self: Skill, step: Step) -> Array:
+        """Return the skill's reward with a bonus where the event of the repair holds."""
         own = skill.reward(step) if skill.defines("reward") else step.reward
         over = np.asarray(step.terminated, bool)
         if skill.defines("termination"):

@@ -102,6 +102,7 @@ class Rule(Selector):
     # Goals
 
     def _space(self, name: str, kind: type[SkillweaveError]) -> Space:
+        """Return the space of a skill's goals; raise where a rule gave one for a skill without."""
         if name not in self.goals:
             raise kind(
                 f"{self.who} gave a goal for skill {name!r}, which has no goals: set its "

@@ -220,6 +220,7 @@ def _line(label: str, curves: Sequence[Curve], band: Band) -> Line:
 
 
 def _caption(lines: Sequence[Line], band: Band) -> str:
+    """Return the figure's sentence on its lines and bands."""
     counts = sorted({line.seeds for line in lines})
     if counts == [1]:
         return "Lines: one seed each."
@@ -273,6 +274,7 @@ def _draw(
 
 
 def _save(figure: Any, out: Path) -> tuple[Path, ...]:
+    """Save the figure of learning curves as PNG and SVG."""
     stem = out.with_suffix("") if out.suffix in (".png", ".svg") else out
     paths = tuple(stem.parent / f"{stem.name}{suffix}" for suffix in (".png", ".svg"))
     with written(stem):

@@ -71,6 +71,7 @@ class Display:
         self._try(self._close)
 
     def _try(self, act: Callable[..., None], *arguments: str) -> None:
+        """Draw, unless drawing failed before; a terminal that is gone ends the display."""
         if self._draws:
             try:
                 act(*arguments)
@@ -125,6 +126,7 @@ class Bars(Display):
         bars.start()
 
     def _draw(self) -> None:
+        """Draw the bars of progress on the terminal."""
         for key, row in self._rows.items():
             texts = {k: getattr(row, k) for k in ("steps", "result", "speed", "left")}
             if key not in self._tasks:
@@ -155,6 +157,7 @@ class Cell(Display):
         self._messages: list[str] = []
 
     def _draw(self) -> None:
+        """Draw the table of progress in a notebook's cell."""
         indent = "\N{NO-BREAK SPACE}" * 4
         cells, lines = [], []
         for row in self._rows.values():

@@ -129,6 +129,7 @@ def remove(path: Path) -> None:
 
 
 def _unwritten(path: Path, error: OSError) -> RunError:
+    """Return the RunError for a file of a run that could not be written."""
     if isinstance(error, FileNotFoundError):
         return RunError(
             f"could not write {path}: its directory no longer exists; was it deleted or moved?"
@@ -274,7 +275,7 @@ def check_unchanged(path: Path, header: Mapping[str, Any], recorded: str | None)
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """Return the header alone, quickly: its checksum is not compared.
+    """Return the header of a safetensors file alone, quickly: no checksum is compared.
 
     Raises:
         RunError: as ``read_tensors``.
@@ -283,6 +284,7 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def _open(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the header and the tensors of a safetensors file of a run."""
     check_utf8(path)
     check_file(path)
     try:

@@ -166,6 +166,7 @@ def _random_state(generator: Any) -> Any:
 
 
 def _set_random_state(generator: Any, state: Any) -> None:
+    """Set the state of a random generator that a user's function may have drawn from."""
     for kind, (_, write) in GENERATORS.items():
         if isinstance(generator, kind):
             write(generator, state)

@@ -40,6 +40,7 @@ def _range(value: Any) -> tuple[float, float]:
 
 
 def _places(value: Any) -> slice | tuple[int, ...]:
+    """Return places in a mapping, as a user or a file writes them: a slice or a tuple."""
     if isinstance(value, str):  # as files have slices
         value = slice(*(int(x) if x else None for x in value.split(":")))
     if isinstance(value, slice):
@@ -431,6 +432,7 @@ def checked_sees(sees: Any, of_skill: bool = False) -> dict[str, tuple[Source, .
 
 
 def _checked_parts(parts: Any, where: str, of_skill: bool) -> tuple[Source, ...]:
+    """Return an entry of ``sees`` as sources: parts, goals, last actions, functions."""
     size = parts.size if isinstance(parts, np.ndarray) else None
     if size == 0 or (isinstance(parts, list | tuple | range) and not parts):
         raise DeclarationError(f"{where} is empty; name at least one part of the observation")
@@ -440,6 +442,7 @@ def _checked_parts(parts: Any, where: str, of_skill: bool) -> tuple[Source, ...]
 
 
 def _checked_acts(acts: Any) -> Acts | None:
+    """Return ``acts`` of a mapping as ``Acts``; None: not given."""
     if acts is None or isinstance(acts, Acts):
         return acts
     if is_places(acts) or isinstance(acts, list | tuple):

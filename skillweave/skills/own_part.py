@@ -252,6 +252,7 @@ def _written(acts: Any, space: Space[Any], who: str) -> tuple[Data, tuple[int, .
 
 
 def _named(names: tuple[str, ...], space: Data, who: str) -> tuple[Data, Paths]:
+    """Return the parts of a Dict action that a skill's ``acts`` names, and their paths."""
     found: dict[tuple[str, ...], Data] = {}
     for name in names:
         path = tuple(name.split("."))

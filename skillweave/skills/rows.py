@@ -118,6 +118,7 @@ def as_type(x: Any, kind: str) -> Any:
 
 
 def _other_type(dtype: np.dtype[Any], kind: str) -> np.dtype[Any]:
+    """Return another type of whole numbers for rows with which a function is called again."""
     if dtype.names:
         parts = [(name, _other_type(dtype[name], kind)) for name in dtype.names]
         return np.dtype(parts, align=dtype.isalignedstruct)

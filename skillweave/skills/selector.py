@@ -179,6 +179,8 @@ class FunctionSelector(ReadySelector):
         return FunctionRule(*self._rule_of, Wrapped(self.function, self._ask), asks_last)
 
     def _ask(self, obs: Array, *last: LastCall) -> Any:
+        """Call the user's selector function; return skills, and goals if it gives some."""
+
         def convert(value: Any) -> Any:
             self.in_place.parted(value, len(obs))
             return value
@@ -224,6 +226,7 @@ class TreeSelector(ReadySelector):
         return selectors.Tree(*self._rule_of, self._node(self.root))
 
     def _node(self, node: Node) -> selectors.Node:
+        """Return a declared node of a behaviour tree as the one that acts."""
         if isinstance(node, Condition):
             return TreeCondition(node.name, checked_function(node.function, self._who, node.name))
         if isinstance(node, Composite):

@@ -190,6 +190,7 @@ def _whole(policy: Any, skill: Skill | None, part: OwnPart | None) -> RowPolicy:
 
 
 def _skill(skills: SkillSet, i: int) -> CalledSkill:
+    """Return a declared skill as the ``CalledSkill`` that acts in its hierarchy."""
     skill = skills.skills[i]
     path, goals = path_of(skill), goals_of(skill)
     policy = _whole(skills.policies[i], skill, skills.part(i))

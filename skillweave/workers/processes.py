@@ -256,6 +256,7 @@ def _in_starter(start: Callable[[], None]) -> None:
     errors: list[BaseException] = []
 
     def run() -> None:
+        """Start the worker process in this thread; keep an error for the caller."""
         try:
             with _start_lock:
                 start()
