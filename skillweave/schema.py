@@ -143,7 +143,7 @@ class _Unfit(Exception):
 
 
 class _Fitting:
-    """A converter of values to kinds.
+    """A converter of fields' values to the kinds of their annotations.
 
     Args:
         file: values are plain JSON from this file; None: they are declared.
@@ -391,7 +391,7 @@ def options_of(kind: Any) -> list[Any]:
 
 
 def flat(settings: Any, prefix: str = "") -> dict[str, Any]:
-    """Return settings by name, those in a group by dotted names: ``network.hidden``.
+    """Return settings of a dataclass by name, those in a group by dotted names.
 
     Args:
         settings: a dataclass.

@@ -72,7 +72,7 @@ def _evaluate(command: commands.EvaluateCommand) -> Result:
 
 
 def _goal(command: commands.Watched) -> Any:
-    """Return the goal of --goal; None: it is not given."""
+    """Return the goal of a command's ``--goal``; None: it is not given."""
     try:
         return None if command.goal is None else json.loads(command.goal)
     except ValueError as error:
@@ -205,7 +205,7 @@ def _compare(command: commands.CompareCommand) -> Result:
 
 
 def _about(page: dict[str, Any]) -> Result:
-    """Return the result of a command that has written a page."""
+    """Return the result of a command that has written an HTML page."""
     lines = [page["verdict"].replace("`", "")] if "verdict" in page else []
     lines += [f"{page['path']}: {page['bytes'] / 1e6:.1f} MB, written in {page['seconds']:.1f} s"]
     lines += [f"missing: {line}" for line in page["missing"]]
@@ -256,7 +256,7 @@ def _info(command: commands.InfoCommand) -> Result:
 
 
 def _handover_lines(matrix: Handover | str | None) -> list[str]:
-    """Return the matrix of a run's log of calls, as lines."""
+    """Return the matrix of a run's log of calls, as lines of ``skillweave info``."""
     if matrix is None:
         return []
     if isinstance(matrix, str):
@@ -267,7 +267,7 @@ def _handover_lines(matrix: Handover | str | None) -> list[str]:
 
 
 def run_lines(manifest: Manifest, saved: Iterable[SavedEvaluation], target: object) -> list[str]:
-    """Return a run's manifest and its saved evaluations, as lines."""
+    """Return a run's manifest and saved evaluations, as lines that a command prints."""
     created = one_line(manifest.created)
     level = manifest.hierarchy
     lines = [f"{manifest.kind} on {one_line(manifest.env)}, seed {manifest.seed}, made {created}"]
@@ -352,7 +352,7 @@ def _pull(command: commands.PullCommand) -> Result:
 
 
 def _free_path(path: Path) -> Path:
-    """Return ``path``, or the first of path-2, path-3, … that does not exist."""
+    """Return a command's output ``path``, or the first of path-2, path-3 and so on that is free."""
     number = 1
     candidate = path
     while candidate.exists():
@@ -429,7 +429,7 @@ def _load_with_code(path: Path, recipe: str | None) -> Run:
 
 
 def _shipped(run: RunDirectory) -> str | None:
-    """Return a run's recipe if it is shipped, so that its code is trusted.
+    """Return a run's recipe for a command if it is shipped, so that its code is trusted.
 
     With it, the skills' rewards and successes are known.
     """

@@ -28,7 +28,7 @@ class ProcessEnded(TrainingError):
 
 
 class Processes:
-    """A pool of fresh processes, ``count`` at once; an error in its block ends them all."""
+    """A pool of fresh processes for a sweep's runs; an error in its block ends them all."""
 
     def __init__(self, count: int) -> None:
         self._threads = ThreadPoolExecutor(count)
@@ -90,7 +90,7 @@ class Processes:
 
 
 def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Do a job in its process, and send its result or its error."""
+    """Do a job of a sweep in its process, and send its result or its error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     when_parent_ends(lambda: os._exit(1))
     result: Any = None

@@ -165,7 +165,7 @@ def _fail(words: Sequence[str], put: Put, message: str, code: int) -> int:
 
 
 def as_json(result: dict[str, Any]) -> str:
-    """Return a result as JSON, without any character that a terminal obeys; NaN becomes null."""
+    """Return a command's result as JSON that is safe for terminals; NaN becomes null."""
     try:
         text = json.dumps(result, default=str, allow_nan=False)
     except ValueError:
@@ -174,7 +174,7 @@ def as_json(result: dict[str, Any]) -> str:
 
 
 def _finite(data: Any) -> Any:
-    """Return data of JSON in which numbers that JSON lacks (NaN, infinity) are None."""
+    """Return data of a command's JSON in which NaN and infinity are None."""
     if isinstance(data, dict):
         return {key: _finite(value) for key, value in data.items()}
     if isinstance(data, list):

@@ -87,7 +87,7 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
 
 
 def _split(setting: str, wrong: str) -> tuple[str, str]:
-    """Return name and value of ``name=value``; raise a DeclarationError ``wrong`` without them."""
+    """Return name and value of a ``--set name=value``; raise the error ``wrong`` without them."""
     name, sign, text = (part.strip() for part in setting.partition("="))
     if not sign:
         raise DeclarationError(wrong)
@@ -97,7 +97,7 @@ def _split(setting: str, wrong: str) -> tuple[str, str]:
 def _set_total(
     declaration: Declaration, total: int, before: int | None, parts: Sequence[str]
 ) -> None:
-    """Scale the budgets of a declaration that sets some itself, so that ``total`` is trained.
+    """Scale the budgets by ``--set steps=``, of a declaration that sets some itself.
 
     Args:
         before: the declaration's own ``steps``.
@@ -117,7 +117,7 @@ def _set_total(
 
 
 def list_settings(declaration: Declaration) -> dict[str, Any]:
-    """Return the dotted name and the value of every setting."""
+    """Return the dotted name and value of every setting that ``--set`` can change."""
     values: dict[str, Any] = {name: getattr(declaration, name) for name in PLAIN}
     for name, field in GROUPS.items():
         if (group := getattr(declaration, field)) is not None:
@@ -135,7 +135,7 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
 
 
 def _change(declaration: Declaration, owner: tuple[str, ...], changes: Changes) -> None:
-    """Change settings that names starting with ``owner`` belong to.
+    """Change by ``--set`` the settings whose names start with ``owner``.
 
     All at once: some fit only together (num_envs, batch_size).
     """
@@ -203,7 +203,7 @@ def parse_evolve(
 
 
 def _evolution(settings: Changes) -> Evolution:
-    """Return an evolution with these settings."""
+    """Return the evolution that the ``--evolve`` options describe."""
     ranges: dict[str, Range] = {}
     changes: Changes = {}
     start = Evolution()
@@ -235,7 +235,7 @@ def _range(written: str, text: str) -> Range:
 
 
 def replaced(config: Any, changes: Changes) -> Any:
-    """Return ``config`` with the fields at these paths set to parsed values."""
+    """Return ``config`` with the fields that ``--set`` or ``--evolve`` names parsed and set."""
     known = [f.name for f in fields(config)]
     hints = annotations_of(type(config))
     values: dict[str, Any] = {}
@@ -263,7 +263,7 @@ def replaced(config: Any, changes: Changes) -> Any:
 
 
 def _parse(name: str, text: str, hint: Any) -> Any:
-    """Return the ``text`` of a setting as a value of the annotated type."""
+    """Return the text after ``--set name=`` as a value of the annotated type."""
     options = options_of(hint)
     if type(None) in options and text.lower() in ("none", "null"):
         return None

@@ -121,7 +121,7 @@ def read_torch_pickle(path: Path) -> Any:
 
 
 def check_sizes(file: zipfile.ZipFile, size: int, program: str) -> None:
-    """Raise where reading a zip of ``size`` bytes would take far more memory than that."""
+    """Raise where reading a zip with a pickle would take far more memory than its size."""
     total = sum(member.file_size for member in file.infolist())
     if total > LARGEST:
         raise RunError(f"it declares {total:,} bytes; at most {LARGEST:,} are read")
@@ -189,7 +189,7 @@ def check_program(program: bytes) -> None:
 
 
 def _plain(data: Any) -> Any:
-    """Return a pickle's objects as plain tensors, Python numbers and containers."""
+    """Return a checkpoint's pickled objects as plain tensors, numbers and containers."""
     if isinstance(data, dict):
         return {_plain(key): _plain(value) for key, value in data.items()}
     if isinstance(data, list | tuple | set | frozenset):
@@ -202,6 +202,8 @@ def _plain(data: Any) -> Any:
 
 
 class _Unpickler(pickle.Unpickler):
+    """An unpickler of AgileRL's checkpoints that makes only plain things, and runs no code."""
+
     def __init__(self, data: Any, file: zipfile.ZipFile, prefix: str) -> None:
         super().__init__(data, encoding="utf-8")
         self._file = file

@@ -367,7 +367,7 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
 
 
 def _alike(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
-    """Return whether spaces have the same kind, shape and type, and their parts by name, too."""
+    """Return whether spaces of an environment and its pool have the same kind, shape and type."""
     if not isinstance(a, type(b)) or a.shape != b.shape or a.dtype != b.dtype:
         return False
     ones, others = parts(a) or {}, parts(b) or {}

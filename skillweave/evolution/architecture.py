@@ -117,7 +117,7 @@ def _steps(size: int, by: int, limits: tuple[int, int]) -> list[int]:
 
 
 def _fits(config: AlgorithmConfig, by: int, mutations: Mutations) -> bool:
-    """Return whether a layer can be added or removed."""
+    """Return whether a mutation can add or remove a layer."""
     network = config.network
     fewest = mutations.layers[0]
     behind = len(network.hidden) - getattr(config, "dueling", False)
@@ -202,7 +202,7 @@ def _carried(
 
 
 def _parts_of(net: Any, change: Change) -> Sequence[Units | Joint | str]:
-    """Return the parts of a network that a mutation changes: units, the last layer, or filters."""
+    """Return the parts of a member's network that a mutation changes: units, layer, filters."""
     if change.kind == "layer":
         joint = joint_of(net)
         return [joint] * (change.by > 0 or joint.depth > 1)
@@ -245,7 +245,7 @@ PAIRED: tuple[Activation, ...] = ("silu", "gelu")
 
 
 def fresh(named: Views, units: Units, extra: int, generator: torch.Generator) -> dict[str, Tensor]:
-    """Draw parameters of ``extra`` new units, by name: He-normal weights, biases zero.
+    """Draw a mutation's ``extra`` new units, by parameter: He-normal weights, biases zero.
 
     The deviations of noisy weights are the mean of the existing ones.
     """

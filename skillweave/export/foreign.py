@@ -99,7 +99,7 @@ class _Called(nn.Module):
 
 
 def _nested(space: gym.Space[Any], leaves: Iterator[Tensor], dtype: torch.dtype) -> Any:
-    """Return the leaves in the structure of the module's input."""
+    """Return the leaves in the structure of the input of an exported module."""
     inner = parts(space)
     if inner is None:
         return next(leaves).to(dtype)
@@ -108,7 +108,7 @@ def _nested(space: gym.Space[Any], leaves: Iterator[Tensor], dtype: torch.dtype)
 
 
 def _examples(policy: Mapped, space: gym.Space[Any]) -> dict[str, Tensor]:
-    """Return one example of each input of a model, by the name in the file."""
+    """Return one example of each input of a model to export, by the name in the file."""
     if policy.inputs is None:
         return examples(space)
     shapes = {name or OBS: given.shape for name, given in policy.inputs.items()}

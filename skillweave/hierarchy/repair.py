@@ -208,7 +208,7 @@ class PairChoice(RandomChoice):
 
 @dataclass(frozen=True)
 class Measured:
-    """A measurement of handovers."""
+    """A measurement of handovers before or after a repair."""
 
     matrix: Handover
     log: CallLog
@@ -290,7 +290,7 @@ def measure(
 
 
 def _sum(one: Handover, other: Handover) -> Handover:
-    """Return the sum of two handover matrices of the same skills."""
+    """Return the sum of two handover matrices that are measured for a repair."""
     added = ("calls", "done", "began_late", "steps", "cut_else")
     counts = {k: getattr(one, k) + getattr(other, k) for k in added}
     limit = max(one.time_limit, other.time_limit)
@@ -333,7 +333,7 @@ def rehearsed_obs(
 
 
 def matrix_to_json(matrix: Handover) -> Matrix:
-    """Return a handover matrix as ``run.json`` records it."""
+    """Return a handover matrix as a repair's entry in ``run.json`` records it."""
     calls, done, late = (x.tolist() for x in (matrix.calls, matrix.done, matrix.began_late))
     needed = None if matrix.needed is None else matrix.needed.tolist()
     by_itself = list(matrix.by_itself)

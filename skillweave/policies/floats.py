@@ -19,7 +19,7 @@ _PROGRAM: ContextVar[dict[str, Any] | None] = ContextVar("_PROGRAM", default=Non
 
 @contextmanager
 def usual_floats() -> Iterator[None]:
-    """Handle errors of floats as NumPy does by default, or ignore what the program ignores."""
+    """Handle NumPy's float errors while policies act: as by default, or as the program ignores."""
     now: dict[str, Any] = dict(np.geterr())
     usual: dict[str, Any] = {kind: "ignore" if now[kind] == "ignore" else "warn" for kind in now}
     usual["under"] = "ignore"

@@ -15,7 +15,7 @@ from skillweave._internal.terminal import end_quietly, printable
 
 @dataclass
 class Row:
-    """A line of progress."""
+    """A line of displayed progress."""
 
     name: str
     """The activity."""
@@ -39,7 +39,7 @@ class Row:
 
 
 class Display:
-    """A display of rows, each under the ones before.
+    """A display of rows of progress, each under the ones before.
 
     It turns silent once it cannot be drawn, so that training continues: its reader has ended, or
     the disk of a log is full.

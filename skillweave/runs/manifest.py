@@ -219,7 +219,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Matrix:
-    """Counts of calls, and of those that were done, by the skill before (``Handover``)."""
+    """Counts of calls and done ones in ``run.json``, by the skill before (``Handover``)."""
 
     skills: list[str]
     calls: list[list[Count]]
@@ -440,7 +440,7 @@ MetricsLine = TypedDict(
 
 @dataclass(frozen=True)
 class Origin:
-    """The origin of a member: its parent, and the old and new values of changed settings."""
+    """The origin of a member, in a run's files: its parent, and changed settings."""
 
     parent: Count | None = None
     mutation: str = "start"

@@ -248,7 +248,7 @@ def qualified(thing: Any) -> str:
 
 
 def made_up(space: Space[Any], n: int) -> Array:
-    """Draw n elements of a space as one batch; none are huge, as a space's bounds may be."""
+    """Draw n elements of a space, none of them huge, to try out a policy from elsewhere."""
     drawn = draw_from(space, n, np.random.default_rng(0))
     for path, leaf in space_of(space).leaves.items():
         part = at(drawn, path)

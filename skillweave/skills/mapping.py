@@ -23,7 +23,7 @@ from skillweave.schema import Check, fitted, settings
 
 
 def floats(value: Any) -> float | tuple[float, ...]:
-    """Return finite numbers as a float, or a tuple of such; raise a ValueError: they are none."""
+    """Return finite numbers of a declared mapping as floats; raise a ValueError: they are none."""
     array = np.asarray(value, np.float64)
     if isinstance(value, str | bool) or array.ndim > 1 or not array.size:
         raise ValueError
@@ -342,7 +342,7 @@ def mapping_of(
 
 
 def function_name(function: Any) -> str:
-    """Return the name of a user's function in files."""
+    """Return the name of a function that a user declares, in files."""
     try:
         return str(named(function, "a function"))
     except DeclarationError:  # a method of an object, for example
@@ -388,7 +388,7 @@ _NOT_OF_SKILLS: dict[type[Any], str] = {
 
 
 def is_places(value: Any) -> bool:
-    """Return whether a value is one place, or several: a slice, a range, a list or an array."""
+    """Return whether a value in ``sees`` or ``acts`` is one place, or several."""
     if isinstance(value, slice | range | np.ndarray):
         return True
     return _is_whole(value) or (
@@ -453,7 +453,7 @@ def _checked_acts(acts: Any) -> Acts | None:
 
 
 def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
-    """Return the entries of the recurrent state, and True if it is one array."""
+    """Return the declared recurrent state of a policy, and True if it is one array."""
     if state is None:
         return (), False
     if isinstance(state, Mapping) and state:
@@ -477,7 +477,7 @@ def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
 
 
 def to_json(value: Any, names: Mapping[int, str] | None = None) -> Any:
-    """Return settings as JSON; those that have their defaults are left out.
+    """Return a declared mapping's settings as JSON; those with their defaults are left out.
 
     Args:
         value: a slice becomes a text, ``0:45``.

@@ -36,7 +36,7 @@ class LimitedCalls(Choices):
 
 @dataclass(frozen=True)
 class SkillSet(LimitedCalls):
-    """Skills with their policies, and the limits of their calls; for ``acting_policy``."""
+    """The declared skills below a selector, with policies and limits; for ``acting_policy``."""
 
     skills: tuple[Skill, ...]
     policies: tuple[Any, ...]
@@ -145,7 +145,7 @@ def within(policy: RowPolicy) -> CallAndReturn:
 
 
 def in_place(policy: Any, who: str = "the policy's act()") -> RowPolicy:
-    """Return a policy of any form as a ``RowPolicy``; ``who`` is for messages."""
+    """Return a skill's policy, of any form, as a ``RowPolicy``; ``who`` is for messages."""
     if isinstance(policy, RowPolicy):
         return policy
     if isinstance(policy, Functional) and policy.is_plain:
@@ -177,7 +177,7 @@ def acting_apart(
 def _overridden(
     policy: RowPolicy, reflexes: tuple[Reflex, ...], space: gym.Space[Any]
 ) -> RowPolicy:
-    """Return a policy with reflexes."""
+    """Return a policy with the declared reflexes around it."""
     acts = space_of(space)
     return Reflexes(policy, tuple(reflex.override(acts) for reflex in reflexes), acts)
 
@@ -242,7 +242,7 @@ ENDS = ("initiation", "termination", "success")
 
 
 def _check_memory(policy: RowPolicy) -> None:
-    """Raise a PolicyError where a checkpoint could not hold a policy's memory."""
+    """Raise a PolicyError where a checkpoint could not hold the memory of a user's policy."""
     if not isinstance(policy, Returns):
         return
     for name, value in policy.start(1).items():
