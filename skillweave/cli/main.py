@@ -118,7 +118,7 @@ def _main(words: Sequence[str], put: Put, alone: bool) -> int:
 
 @contextmanager
 def _short_interrupts(words: Sequence[str], put: Put) -> Iterator[None]:
-    """End the process at Ctrl-C within the block, in which large libraries are imported.
+    """End the command at Ctrl-C within the block, in which large libraries are imported.
 
     An exception in the middle of an import may be lost, or become another one.
     """

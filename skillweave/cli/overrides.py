@@ -50,7 +50,7 @@ _LINEAR = re.compile(r"[lL]inear\(([^,()]*,[^,()]*)\)")
 
 
 def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
-    """Change a declaration in place by ``name=value`` strings, in any order.
+    """Change a declaration in place by ``--set name=value`` strings, in any order.
 
     The name of an agent alone sets its algorithm: ``selector=DQN``, ``skills.center=SAC``.
 
@@ -171,7 +171,7 @@ def _change(declaration: Declaration, owner: tuple[str, ...], changes: Changes) 
 def parse_evolve(
     settings: Sequence[str], declaration: Declaration, flat: bool
 ) -> dict[str, Evolution | None] | None:
-    """Return each stage's evolution, or None where nothing is to evolve.
+    """Return the evolution of each stage by ``--evolve``, or None where nothing is to evolve.
 
     A name may begin with a stage; settings without one hold for all. ``selection=truncation``
     takes that selection, ``ranges.gamma=0.9,0.999,complement`` lets a setting mutate.

@@ -430,7 +430,7 @@ def episode_seed(root: int, row: int, episode: int) -> int:
 
 
 def checksums(obs: Array) -> Array:
-    """Return a checksum for each row of observations (n, *obs_shape), (n,) int64."""
+    """Return a checksum for each row of an engine's observations, (n,) int64."""
     sums = [0] * len(obs)
     for part in leaves(obs):
         rows = (np.ascontiguousarray(row).tobytes() for row in part)

@@ -138,7 +138,7 @@ def _cnn(member: Member, spaces: Any) -> CNN | None:
 
 
 def changed(network: Network, change: Change, cnn: CNN | None, dueling: bool) -> Network:
-    """Return the network after a change; ``cnn`` is its current encoder of images."""
+    """Return a member's network after a change; ``cnn`` is its current encoder of images."""
     if change.kind == "channels":
         assert cnn is not None
         new = tuple(c + change.by * (i == change.layer) for i, c in enumerate(cnn.channels))
@@ -265,7 +265,7 @@ def fresh(named: Views, units: Units, extra: int, generator: torch.Generator) ->
 
 
 def widened(named: Views, units: Units, extra: int, new: Views | None) -> dict[str, Tensor]:
-    """Add ``extra`` units with outgoing weights of zero; ``new`` None: zeros, for moments."""
+    """Add a mutation's ``extra`` units with outgoing weights of zero; ``new`` None: moments."""
     grown = dict(named)
     for part in (*units.own, *units.onward):
         old = grown[part.name]
@@ -383,7 +383,7 @@ def _renamed(named: Views, joint: Joint, by: int) -> dict[str, Tensor]:
 
 
 def _moved(name: str, joint: Joint, by: int) -> str:
-    """Return a parameter's new name: the head is the layer after the hidden ones."""
+    """Return a parameter's new name after a mutation: the head follows the hidden layers."""
     head = f"{joint.prefix}.{joint.depth}."
     if not name.startswith(head):
         return name

@@ -30,7 +30,7 @@ AT_ONCE = 1 << 26
 def seen_by(
     skill: Skill, step: Step, elapsed: Array, rows: Array | None = None, goal: Array | None = None
 ) -> Step:
-    """Return a step as a skill sees it, whose calls have their own time.
+    """Return a step of a trace as a skill sees it, whose calls have their own time.
 
     Where the environment is scored by a task, a skill sees the environment's own reward.
 

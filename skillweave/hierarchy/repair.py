@@ -144,7 +144,7 @@ def event_of(skill: Skill, done: Mapping[str, Any] | None) -> Callable[[Step], A
 
 
 def eager(skill: Skill, holds: Callable[[Step], Array], bonus: float, rest: float) -> Skill:
-    """Return a skill that is also paid while its event holds, so that it gets there quickly.
+    """Return a skill under repair, also paid while its event holds, so that it gets there fast.
 
     Its own reward may be content with a call that comes too late.
 
@@ -170,7 +170,7 @@ def eager(skill: Skill, holds: Callable[[Step], Array], bonus: float, rest: floa
 
 
 class PairChoice(RandomChoice):
-    """A selector that calls one skill after each other one, and another one often before it.
+    """A selector that measures a repair: it calls one skill after each other, one often before it.
 
     Args:
         skills: names.
@@ -232,7 +232,7 @@ def measure(
     num_envs: int,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Measured:
-    """Let skills act until one was called after another one often enough; return the handover.
+    """Measure a handover for a repair: let skills act until one followed the other often.
 
     Args:
         skills: of one level; ``skill`` and ``after`` are names there.

@@ -43,7 +43,7 @@ def manifest(
     flat: bool | AlgorithmConfig = False,
     how: TrainDefaults | None = None,
 ) -> Manifest:
-    """Return the content of ``run.json`` for a new run of a declaration.
+    """Return the content of ``run.json`` for a new run of a declared hierarchy.
 
     Args:
         flat: a manifest of the flat baseline: with its own settings, or with these.

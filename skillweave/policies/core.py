@@ -99,7 +99,7 @@ def part_of(
     max_steps: int | None = None,
     goal: Array | None = None,
 ) -> Step:
-    """Return a step as a skill sees it, which counts its own steps and has its own limit.
+    """Return a step as an acting skill sees it, with steps and a limit of its own call.
 
     Args:
         elapsed: (m,) steps so far, this one included.
@@ -151,7 +151,7 @@ SUCCESS = "success"
 
 
 def own_step(step: Step) -> Step:
-    """Return a step of a task's environment as the environment itself gave it.
+    """Return a task's step, for a policy that acts, as the environment itself gave it.
 
     A task's environment (``planning.task_env``) has the task's reward and success, and keeps the
     environment's own in ``info``. A step of another environment is returned unchanged.
@@ -344,7 +344,7 @@ def innermost(policy: RowPolicy) -> RowPolicy:
 
 
 def code(what: str, label: str = "", *, needed: bool = True) -> Any:
-    """Return a field that holds a function of the user, which exports name and do not write.
+    """Return a field of a policy with a user's function, which exports name and do not write.
 
     Args:
         what: what it takes and returns, for the list of functions that an export needs.

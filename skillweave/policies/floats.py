@@ -35,7 +35,7 @@ def usual_floats() -> Iterator[None]:
 
 
 def by_program(function: Callable[..., Any], *args: Any, **named: Any) -> Any:
-    """Return the result of a function of the program, with the handling that it has set."""
+    """Return the result of a program's function in a policy, with the float handling it has set."""
     program = _PROGRAM.get()
     if program is None:
         return function(*args, **named)

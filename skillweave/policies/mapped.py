@@ -141,7 +141,7 @@ def _one_hot(choice: Array, count: int) -> Array:
 def numbers_of(
     function: Callable[..., Any], obs: Array, who: str, shape: tuple[int, ...] | None = None
 ) -> Array:
-    """Return the numbers (n, ...) that a user's function makes of observations; (n,) as (n, 1).
+    """Return the numbers (n, ...) that a function makes for a model as it acts; (n,) as (n, 1).
 
     Raises:
         PolicyError: it returned something else, or another ``shape`` of one environment.

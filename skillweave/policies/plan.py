@@ -287,7 +287,7 @@ class Options:
 def nearest(
     points: Array, to: Array, count: int, group: Array, squares: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return the ``count`` nearest points to each row of ``to``, each of another group.
+    """Return the ``count`` points of a plan nearest to each row of ``to``, of other groups.
 
     Args:
         points: (m, F) float32.

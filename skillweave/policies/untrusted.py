@@ -99,7 +99,7 @@ def parse_json(text: str | bytes, where: Path | str) -> Any:
 
 
 def load_json(text: str | bytes, **how: Any) -> Any:
-    """Load JSON as ``json.loads`` does, without lone surrogates, which cannot be shown or saved.
+    """Load JSON from others as ``json.loads`` does, without lone surrogates.
 
     Raises:
         ValueError: it is not JSON, or holds a lone surrogate.

@@ -81,7 +81,7 @@ def notice_changes(then: Texts, now: Texts, since: str) -> None:
 
 
 def changes(then: Texts, now: Texts) -> str:
-    """Return the recorded differences of the user's code, as clauses; empty: there are none."""
+    """Return how a run's recorded user code differs from now, as clauses; empty: it does not."""
     clauses = []
     for what, text in now.items():
         before = then.get(what)

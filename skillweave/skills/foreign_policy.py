@@ -123,7 +123,7 @@ def fitted(
 
 
 def _other_parts(mine: Space[Any], theirs: Space[Any]) -> str:
-    """Return a clause that names parts which only one of two spaces has; nothing if none."""
+    """Return a clause on parts that only the space of a foreign policy, or the other, has."""
     ours, others = (getattr(space, "spaces", None) for space in (mine, theirs))
     if not isinstance(ours, Mapping) or not isinstance(others, Mapping):
         return ""
@@ -213,7 +213,7 @@ def as_recorded(
     read: Callable[[], bytes | None],
     where: str,
 ) -> Policy:
-    """Return the policy at the time when ``recorded`` was its source; ``read`` reads the copy.
+    """Return a skill's ready policy as of when ``recorded`` was its source; ``read`` reads a copy.
 
     Raises:
         RunError: the policy has another kind, or another checksum without a copy; or the copy or

@@ -151,7 +151,7 @@ GENERATORS: dict[type, tuple[Callable[[Any], Any], Callable[[Any, Any], Any]]] =
 
 
 def _global_generators() -> Iterator[Any]:
-    """Yield the generators of Python, NumPy and torch; torch is not imported for that."""
+    """Yield the global generators that a user's function may draw from; torch if imported."""
     yield random.random.__self__  # type: ignore[attr-defined]
     yield np.random.get_state.__self__  # type: ignore[attr-defined]
     if (torch := sys.modules.get("torch")) is not None:

@@ -148,7 +148,7 @@ def checked(
     elapsed: Array | int | None = None,
     ids: Array | None = None,
 ) -> Array:
-    """Convert ``value`` to an array (n,) of ``dtype``: bool, or the type of rewards.
+    """Convert a user's answer to an array (n,) of ``dtype``: bool, or the type of rewards.
 
     Args:
         elapsed: steps of the rows, (n,) or (), for messages.
@@ -265,7 +265,7 @@ def _advice(error: BaseException, function: Any, argument: Any, ids: Array | Non
 
 
 def blame(error: BaseException, who: str) -> NoReturn:
-    """Raise a PolicyError that names ``who`` where the user's code raised ``error``.
+    """Raise a PolicyError that names ``who`` where the user's function raised ``error``.
 
     Otherwise raise ``error`` itself: its traceback shows a bug of this library.
     """

@@ -68,7 +68,7 @@ _notes: dict[int, tuple[weakref.ref[Any], dict[Any, Any]]] = {}
 
 
 def _notes_of(owner: Any) -> dict[Any, Any] | None:
-    """Return this process's notes about an object; None: it can have none."""
+    """Return the notes about looks at a user's object; None: it can have none."""
     key = id(owner)
     if key not in _notes:
         try:

@@ -366,7 +366,7 @@ def _moments(normalize: Any, space: Space[Any]) -> tuple[Array, Array, float]:
 
 
 def _variance(rms: Any) -> Array:
-    """Return the variances in a ``RunningMeanStd``; 1 of constants, as in ``scale_of``.
+    """Return the variances in a ``VecNormalize``'s statistics; 1 of constants.
 
     It begins as if 1e-4 samples with mean 0 and variance 1 had been seen.
     """

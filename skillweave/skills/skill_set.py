@@ -99,7 +99,7 @@ def acting_policy(
     *,
     outermost: bool = True,
 ) -> RowPolicy:
-    """Return the policy of a selector and its skills, which act in calls, with reflexes.
+    """Compile a selector and its declared skills to the policy that acts in calls, with reflexes.
 
     Args:
         skills: with their policies; one that has skills and a selector itself is a hierarchy.
@@ -129,7 +129,7 @@ def acting_policy(
 
 
 def acting_alone(skills: SkillSet, i: int) -> RowPolicy:
-    """Return the policy of skill ``i`` without a selector, with reflexes."""
+    """Compile the declared skill ``i``, without a selector, to a policy with reflexes."""
     skill = skills.skills[i]
     space = skills.action_space
     policy = acting_apart(skills.policies[i], skill, skills.part(i), skills.reflexes, space)
@@ -161,7 +161,7 @@ def acting_apart(
     reflexes: tuple[Reflex, ...],
     space: gym.Space[Any],
 ) -> RowPolicy:
-    """Return the policy of a skill that acts by itself, or of a plain agent, with reflexes.
+    """Compile a declared skill that acts by itself, or a plain agent, to a policy with reflexes.
 
     Args:
         policy: the skill's; see ``policy_of``.

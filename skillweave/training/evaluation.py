@@ -283,7 +283,7 @@ def interquartile_mean(values: Array) -> float:
 
 
 def interquartile_means(values: Array) -> Array:
-    """Return interquartile means over the first axis of an array (n, …): (…)."""
+    """Return interquartile means of evaluations over the first axis of (n, …): (…)."""
     x = np.sort(np.asarray(values, float), axis=0)
     n = len(x)
     quarter = n / 4
