@@ -143,7 +143,7 @@ class _Unfit(Exception):
 
 
 class _Fitting:
-    """A converter of values to kinds.
+    """A converter of fields' values to the kinds of their annotations.
 
     Args:
         file: values are plain JSON from this file; None: they are declared.
@@ -280,6 +280,7 @@ class _Fitting:
         return value
 
     def _sequence(self, origin: Any, inner: tuple[Any, ...], value: Any, path: str) -> Any:
+        """Return a list or tuple whose entries fit the kinds of its annotation."""
         kinds: Sequence[Any] = inner
         if origin is not tuple or Ellipsis in inner:
             kinds = [inner[0]] * len(value)
@@ -390,7 +391,7 @@ def options_of(kind: Any) -> list[Any]:
 
 
 def flat(settings: Any, prefix: str = "") -> dict[str, Any]:
-    """Return settings by name, those in a group by dotted names: ``network.hidden``.
+    """Return settings of a dataclass by name, those in a group by dotted names.
 
     Args:
         settings: a dataclass.
@@ -481,6 +482,7 @@ def settings(kind: C) -> C:
     own = getattr(cls, "__post_init__", None)
 
     def checked(self: Any) -> None:
+        """Check all fields by their annotations, then run the class's own checks."""
         first = next(k for k in type(self).__mro__ if "_checks_fields" in vars(k))
         if first is kind:  # else the subclass that called this has checked already
             check_fields(self)
@@ -526,6 +528,7 @@ def annotations_of(kind: Any) -> dict[str, Any]:
 
 @cache
 def _annotations_of(kind: Any) -> dict[str, Any]:
+    """Return the annotations of a settings class's fields, those of its bases included."""
     base = next((k for k in kind.__mro__ if "_checks_fields" in vars(k)), None)
     if base is None or base is kind:
         return get_type_hints(kind, include_extras=True)

@@ -45,8 +45,11 @@ def checked_names(target: T) -> T:
 
 
 def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function whose wrong arguments raise a DeclarationError with a hint."""
+
     @functools.wraps(function)
     def checked(*args: Any, **named: Any) -> Any:
+        """Call the function; explain a TypeError where its arguments do not fit."""
         try:
             with usual_floats():
                 return function(*args, **named)
@@ -115,7 +118,7 @@ def _other_places(owner: type, makes: bool) -> dict[str, str]:
 
 
 def _settings(kind: Any, group: str, example: str) -> dict[str, str]:
-    """Return where the settings of a dataclass, and of groups in it, are given, by name."""
+    """Return by name where settings of a dataclass are given, to hint at the meant one."""
     inside: dict[str, str] = {}
     own = fields(kind) if is_dataclass(kind) else ()
     for field in reversed(own):
@@ -127,7 +130,7 @@ def _settings(kind: Any, group: str, example: str) -> dict[str, str]:
 
 
 def _group(owner: Any, field: Any) -> Any:
-    """Return the dataclass of a field's instance; None: it holds something else."""
+    """Return the dataclass of a field's settings, to hint at the names in it; None: others."""
     made = field.default if field.default_factory is MISSING else field.default_factory()
     if is_dataclass(made) and not isinstance(made, type):
         return type(made)
@@ -142,7 +145,7 @@ def _group(owner: Any, field: Any) -> Any:
 
 
 def _set(self: Any, name: str, value: Any) -> None:
-    """Set an attribute that exists, or a private one; none where the dataclass is frozen."""
+    """Set an attribute that exists, or a private one, unless frozen; else hint at the meant one."""
     kind = type(self)
     own = [f.name for f in fields(self)]
     frozen = kind.__dataclass_params__.frozen

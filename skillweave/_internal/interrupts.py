@@ -36,6 +36,7 @@ def deferred(until: str) -> Iterator[None]:
         return
 
     def on_signal(number: int, frame: Any) -> None:
+        """Note Ctrl-C or SIGTERM; raise KeyboardInterrupt at the second one."""
         _received.append(signal.Signals(number).name)
         if len(_received) > 1:
             raise KeyboardInterrupt
@@ -87,6 +88,7 @@ def stop_handling(number: int, before: Any) -> None:
 
 
 def _leave_to_parent() -> None:
+    """Restore the signal handlers in a forked process: interrupts are left to its parent."""
     for number, handler in _set_here.items():
         if signal.getsignal(number) is handler:  # an environment may have set another one
             with suppress(ValueError):

@@ -134,7 +134,7 @@ def error_text(error: BaseException) -> str:
 
 
 def absolute(path: str | Path) -> Path:
-    """Return the path from the root on, which leads to the same place from everywhere.
+    """Return the path from the root on, for messages and files: it is the same everywhere.
 
     Raises:
         RunError: the working directory, from which it leads, was deleted.

@@ -57,7 +57,7 @@ def named(value: Any, where: str) -> Any:
 
 
 def find(name: str) -> Named | None:
-    """Return the known function for the ``name`` in a file; None if no function fits.
+    """Return the known function of the user for the ``name`` in a file; None: none fits.
 
     The module may have another name now: a recipe is a script, a module or a file to load.
     """
@@ -77,7 +77,7 @@ def known_names() -> str:
 
 
 def _known(name: str, function: Callable[..., Any]) -> Named:
-    """Register a function under its name, in place of an earlier one."""
+    """Register a user's function under its name in files, in place of an earlier one."""
     known = Named(name)
     known.function = function
     _KNOWN[name] = known
@@ -85,6 +85,7 @@ def _known(name: str, function: Callable[..., Any]) -> Named:
 
 
 def _name_of(function: Any, where: str) -> str:
+    """Return the name by which files record a user's function, with its bound arguments."""
     values: dict[str, Any] = {}
     inner = function
     if isinstance(function, functools.partial):

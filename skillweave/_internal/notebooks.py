@@ -72,6 +72,7 @@ class Area:
 
 
 def _row(cells: Sequence[object], left: int, tag: str) -> str:
+    """Return a row of an HTML table for a notebook."""
     parts = []
     for i, cell in enumerate(cells):
         side = "left" if i < left else "right"

@@ -17,7 +17,7 @@ Memory: TypeAlias = dict[str, Array]
 
 
 class Policy(Protocol):
-    """A policy: a map from observations to actions of n environments, with a state of each.
+    """A policy as users write it: observations to actions of n environments, with a state.
 
     ``observe`` receives every transition, so that a policy can detect that a running skill has
     terminated. Rows of ``memory`` belong to environments; a runner gathers and scatters them.

@@ -85,6 +85,7 @@ def lazy(module: str) -> tuple[list[str], Callable[[str], Any], Callable[[], Ite
     homes = HOMES[module]
 
     def get(name: str) -> Any:
+        """Import a public name of the module when it is first used."""
         if name in homes:
             return getattr(import_module(f"skillweave.{homes[name]}"), name)
         if f"{module}.{name}" in HOMES:  # sw.algorithms needs no import of its own

@@ -127,6 +127,7 @@ def global_generators(seeds: Seeds) -> Iterator[None]:
 
 
 def _set_states(states: dict[str, Any]) -> None:
+    """Restore the states of the global random generators."""
     global _changes
     _changes += 1
     random.setstate(states["random"])
@@ -136,7 +137,7 @@ def _set_states(states: dict[str, Any]) -> None:
 
 
 def _forget_threads() -> None:
-    """Let a forked process begin without the blocks of its parent's threads."""
+    """Let a forked process begin without its parent's ``global_generators`` blocks."""
     global _blocks, _lock, _threads
     _blocks = _Blocks()
     _lock = threading.Lock()

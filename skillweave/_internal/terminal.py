@@ -170,7 +170,7 @@ def _discard(stream: Any) -> None:
 
 
 def _take(number: int) -> None:
-    """Open the null device under a number that is free."""
+    """Open the null device under a free number, in place of a closed standard stream."""
     try:
         os.fstat(number)
     except OSError:

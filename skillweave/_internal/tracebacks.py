@@ -71,6 +71,7 @@ def is_own_module(name: str | None) -> bool:
 
 
 def _is_own_file(file: str) -> bool:
+    """Return whether a file of a traceback is the user's: no package's, and not Python's."""
     if file.startswith("<"):
         return file.startswith((SENT, "<stdin>", "<ipython-input-"))
     path = Path(file)

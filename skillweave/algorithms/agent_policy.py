@@ -165,7 +165,7 @@ class AgentHeader:
 def checked_tensor(
     tensors: Mapping[str, Tensor], name: str, shape: tuple[int, ...], dtype: torch.dtype, where: str
 ) -> Tensor:
-    """Return a tensor by name.
+    """Return a tensor of a trained agent's file by name.
 
     Raises:
         RunError: the tensor is missing, or has another shape or type.
@@ -180,7 +180,7 @@ def checked_tensor(
 
 
 def check_finite(tensors: Mapping[str, Tensor], where: str) -> None:
-    """Raise a RunError where a tensor of a file that people share holds NaN or infinity."""
+    """Raise a RunError where a tensor of a trained agent's file holds NaN or infinity."""
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(value.isfinite().all()):
             raise RunError(

@@ -203,7 +203,7 @@ def side_by_side(batches: Sequence[Batch], members: int) -> Batch:
 
 
 def _as_high(batch: Batch, height: int) -> Batch:
-    """Add rows that are not valid until there are ``height``."""
+    """Add rows that are not valid to a batch until there are ``height``."""
     rows, envs = batch.lead
     if rows == height:
         return batch
@@ -217,6 +217,7 @@ def _padded(x: Array, more: int) -> Array:
 
 
 def _joined(parts: list[Array | None], members: int, name: str) -> Array:
+    """Return one column of a batch, joined of the same column of several batches."""
     described = column(name)
     axis = 0 if described.per_env else 1
     example = next(part for part in parts if part is not None)
@@ -229,7 +230,7 @@ def _joined(parts: list[Array | None], members: int, name: str) -> Array:
 
 
 def padded_last_axis(parts: Sequence[Array]) -> list[Array]:
-    """Return arrays whose last axis is as long as the longest; zeros are added."""
+    """Return a column's arrays with last axes as long as the longest; zeros are added."""
     longest = max(part.shape[-1] for part in parts)
     before = [(0, 0)] * (parts[0].ndim - 1)
     return [

@@ -82,7 +82,7 @@ class Compiled:
 
 
 def _advice(error: Exception) -> str:
-    """Return advice on a failed compilation as the beginning of a sentence, or nothing."""
+    """Return advice on a failed compilation of gradient steps, or nothing."""
     from torch._dynamo import exc
 
     if isinstance(error, exc.BackendCompilerFailed):

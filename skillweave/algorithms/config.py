@@ -511,6 +511,7 @@ def registration_of(config: Any) -> Registration:
 
 
 def _not_registered(name: str) -> str:
+    """Return the error message for settings of an algorithm that is not registered."""
     return (
         f"no algorithm is registered for {name}; there are: {', '.join(_REGISTERED)}. An algorithm "
         "of your own must be registered in every process that uses it, before it is used: call "
@@ -543,7 +544,7 @@ def _acts_in(registration: Registration, space: gym.Space[Any]) -> bool:
 
 
 def _has_choices_alone(space: gym.Space[Any]) -> bool:
-    """Return whether goals of a space are choices, whole numbers of a Box with bounds included."""
+    """Return whether an algorithm for choices alone can choose goals of a space."""
     if isinstance(space, _SPACES.Box) and space.dtype.kind != "f":
         from skillweave.spaces.action_codec import choice_counts  # needs torch
 
@@ -552,7 +553,7 @@ def _has_choices_alone(space: gym.Space[Any]) -> bool:
 
 
 def _check_goals(config: Any, spaces: Mapping[str, gym.Space[Any]], where: str) -> None:
-    """Raise a DeclarationError where a selector cannot choose goals of these spaces, by skill."""
+    """Raise a DeclarationError where an algorithm cannot choose goals of these spaces, by skill."""
     able = registration_of(config).chooses_goals
     wrong = [name for name, space in spaces.items() if not _has_choices_alone(space)]
     if able == "discrete" and not wrong:
@@ -596,7 +597,7 @@ def named_config(name: str, where: str) -> AlgorithmConfig:
 
 
 def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
-    """Convert settings to plain JSON, with the algorithm's name under ``algorithm``.
+    """Convert an algorithm's settings to JSON, with its name under ``algorithm``.
 
     Raises:
         DeclarationError: a setting, of a user's own algorithm, cannot be recorded.
@@ -613,7 +614,7 @@ def own_encoders(config: Any) -> list[str]:
 
 
 def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConfig:
-    """Read settings from the JSON of ``config_to_json``.
+    """Read an algorithm's settings from the JSON of ``config_to_json``.
 
     Args:
         file: the file it was read from, for messages.

@@ -435,6 +435,7 @@ class PPOAlgorithm(Algorithm):
         """
 
         def at_ends(rows: Tensor) -> Tensor:
+            """Return the critic's values of the successors in these rows, in units of reward."""
             inputs = self.inputs(params, take_rows(rollout.next_obs.flatten(1, 2), rows))
             if after is None:
                 raw = self.critic_net(params.views, inputs)

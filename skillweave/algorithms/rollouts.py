@@ -16,7 +16,7 @@ from skillweave.ops.device import on_host
 
 
 def rows_where(flags: Tensor) -> Tensor:
-    """Return the indices of each member's True rows, in order; (P, N) bool to (P, K).
+    """Return the indices of each member's True cells of a rollout; (P, N) bool to (P, K).
 
     K is the largest number of True rows of any member; False rows fill up the others'.
     """

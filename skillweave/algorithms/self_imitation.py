@@ -155,7 +155,7 @@ class SelfImitationAlgorithm(PPOAlgorithm):
 
 
 def returns_of(rollout: Rollout) -> tuple[Tensor, Tensor]:
-    """Compute each row's return, (P, T, B), and where it is known, (P, T, B) bool.
+    """Compute returns of a rollout for self-imitation, (P, T, B), and where they are known.
 
     It is known where the trajectory terminates within the rollout. Elsewhere the rest would be the
     critic's estimate, and imitation would repeat its errors.

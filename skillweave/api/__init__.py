@@ -1208,6 +1208,7 @@ class PlannedRun(TrainedPolicy):
         return untasked(self.hierarchy.spec)
 
     def _check_logged(self) -> None:
+        """Raise a DeclarationError: evaluations of a planned run cannot log calls."""
         raise DeclarationError(
             "episodes of a planned run end with its task, so the calls in them are cut there: "
             "leave out log_calls, and record whole calls with "

@@ -50,7 +50,7 @@ def run_html(path: Path, declared: PlainAgent | Declaration) -> str:
 
 
 def _declared(declared: PlainAgent | Declaration) -> tuple[list[tuple[str, object]], list[Markup]]:
-    """Return the names and values of settings, and a hierarchy's table of skills."""
+    """Return the names and values of settings for a notebook, with the table of skills."""
     known: list[tuple[str, object]]
     if isinstance(declared, PlainAgent):
         known = [("agent on", declared.spec.name), ("algorithm", _kind(declared.algorithm))]
@@ -71,7 +71,7 @@ def _steps(steps: int) -> tuple[str, str]:
 
 
 def _skills_table(roles: Roles) -> Markup:
-    """Return a table of a hierarchy's skills; empty columns are left out."""
+    """Return a table of a hierarchy's skills for a notebook."""
     head = ["skill", "policy", "defines", "about", "max_steps"]
     rows = []
     for path, skill in roles.skills.items():
@@ -94,7 +94,7 @@ def _learns_by(roles: Roles, path: str) -> str:
 
 
 def _stages(run: RunDirectory) -> Markup:
-    """Return a table of a run's stages."""
+    """Return a table of a run's stages for a notebook."""
     rows = []
     for stage in run.manifest.stages:
         final = stage.final

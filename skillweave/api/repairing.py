@@ -119,7 +119,7 @@ def repair(
 
 
 def _resume_repair(declared: D, skill: str, after: str, options: RepairOptions) -> Trained[D]:
-    """Finish a repair that was stopped, with the steps that it was started with."""
+    """Finish a stopped run of ``Run.repair``, with the steps that it was started with."""
     if options.run_dir is None:
         raise DeclarationError(
             "resume=True continues a repair, so name its directory: "
@@ -142,7 +142,7 @@ def _resume_repair(declared: D, skill: str, after: str, options: RepairOptions) 
 
 
 def _checked(roles: Roles, skill: Any, after: Any) -> tuple[str, str]:
-    """Check the two skills of a repair, and return their paths.
+    """Check the two skills that ``Run.repair`` is given, and return their paths.
 
     Raises:
         DeclarationError: the first one cannot learn, or may not follow the other one.
@@ -188,7 +188,7 @@ def _measured(
     num_envs: int,
     progress: Progress,
 ) -> Measured:
-    """Measure the handover of a pair of skills before their repair.
+    """Measure the handover of the two skills of ``Run.repair`` before the new run.
 
     Raises:
         DeclarationError: there is nothing to repair, or the skill may not start there, or images
@@ -225,7 +225,7 @@ def _measured(
 
 
 def _stage_name(skill: str, taken: set[str]) -> str:
-    """Return a name for the stage of a repair; no other stage of the run has it."""
+    """Return a name for the stage in the new run of ``Run.repair``; no other stage has it."""
     name = f"{skill}-repair"
     number = 2
     while name in taken:
@@ -241,7 +241,7 @@ Policies = dict[str, dict[str, AgentPolicy]]
 def _content(
     declared: Declaration, source: Path, roles: Roles, policy: HierarchyPolicy
 ) -> tuple[Manifest, Policies]:
-    """Return the manifest of a repair's new run, with finished stages, and their policies."""
+    """Return the manifest of the new run of ``Run.repair``, with finished stages, and policies."""
     policies: Policies = {}
     if source.is_dir():
         run = RunDirectory.open(source)

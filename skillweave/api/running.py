@@ -206,7 +206,7 @@ def _plan(declared: Declared, content: Manifest, options: TrainOptions) -> Mappi
 
 @contextmanager
 def _training(declared: Declared) -> Iterator[ExitStack]:
-    """Train with steady streams and normal tensors, whatever the user's program has set.
+    """Let ``train`` train with steady streams and normal tensors, whatever the program has set.
 
     Notices wait until the progress prints them.
     """

@@ -31,7 +31,7 @@ from skillweave.skills.skill_set import SkillSet, policy_of
 
 
 class OwnPolicy(Functional):
-    """A policy that sees the environment's own observations.
+    """A policy that sees the environment's own observations, without a task's state.
 
     Args:
         policy: made for the environment's own observations.
@@ -69,7 +69,7 @@ class OwnPolicy(Functional):
 
 
 class ViewedSelector(Viewed, Selector):
-    """A ready selector that sees what ``view`` makes of observations."""
+    """A ready selector that sees observations without a task's state, by ``view``."""
 
     policy: Selector
 
@@ -179,6 +179,7 @@ def _own_skill(skill: Skill, policy: Policy, view: OwnView) -> Skill:
     """Return a skill with the methods, limits and colour of another, and a ready policy."""
 
     def seeing(method: str) -> Any:
+        """Return a skill's method that sees the environment's own observations."""
         asked = getattr(skill, method)
 
         def ask(about: Any, *more: Any) -> Any:

@@ -92,7 +92,7 @@ def _of_process() -> int | None:
 
 
 def _text(file: Path) -> str:
-    """Return the text of a file; "" where it does not exist."""
+    """Return the system's text on free memory in a file; "" where it does not exist."""
     try:
         return file.read_text("utf-8")
     except (OSError, ValueError):

@@ -307,7 +307,7 @@ class Columns:
 
 
 def _split_rows(batch: Batch, most: int) -> list[Batch]:
-    """Cut a batch into parts of at most ``most`` rows."""
+    """Cut a batch into parts of at most ``most`` rows, for the rings of the replay store."""
     rows, _ = batch.lead
     if 0 < rows <= most:
         return [batch]
@@ -315,7 +315,7 @@ def _split_rows(batch: Batch, most: int) -> list[Batch]:
 
 
 def copy_into(arrays: dict[str, Array], state: dict[str, Tensor]) -> None:
-    """Copy the tensors of a checkpoint into arrays of the same shapes and types."""
+    """Copy the tensors of a checkpoint into the arrays of a replay store."""
     for name, array in arrays.items():
         into = to_tensor(array)
         stored = state.get(name)

@@ -139,7 +139,7 @@ class RolloutStore:
 
 
 def _valid_first(valid: Array, members: int) -> tuple[Array, Array]:
-    """Order rows (T, N) so that the valid ones of each column come first.
+    """Order rows (T, N) of the store so that the valid ones of each column come first.
 
     Returns:
         Cells (D, N) int64, row and column as one number, where the fullest column has D valid

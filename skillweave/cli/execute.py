@@ -52,6 +52,7 @@ def run(command: commands.Output) -> Result:
 
 
 def _evaluate(command: commands.EvaluateCommand) -> Result:
+    """Carry out ``skillweave evaluate``."""
     trained = _load_target(command)
     score = trained.evaluate(
         command.episodes,
@@ -71,7 +72,7 @@ def _evaluate(command: commands.EvaluateCommand) -> Result:
 
 
 def _goal(command: commands.Watched) -> Any:
-    """Return the goal of --goal; None: it is not given."""
+    """Return the goal of a command's ``--goal``; None: it is not given."""
     try:
         return None if command.goal is None else json.loads(command.goal)
     except ValueError as error:
@@ -82,6 +83,7 @@ def _goal(command: commands.Watched) -> Any:
 
 
 def _render(command: commands.RenderCommand) -> Result:
+    """Carry out ``skillweave render``."""
     trained = _load_target(command)
     path = command.out or Path(f"{Path(command.target).name.removesuffix('.safetensors')}.gif")
     result = trained.render(
@@ -98,6 +100,7 @@ def _render(command: commands.RenderCommand) -> Result:
 
 
 def _log(command: commands.LogCommand) -> Result:
+    """Carry out ``skillweave log``: record calls of a run's skills."""
     run = _load_with_code(command.run, command.recipe)
     if words := lacking_features(run.hierarchy, run.policy):
         notice(words)
@@ -118,6 +121,7 @@ def _log(command: commands.LogCommand) -> Result:
 
 
 def _plan(command: commands.PlanCommand) -> Result:
+    """Carry out ``skillweave plan``: plan a mission on a run's recorded calls."""
     path = Path(command.target)
     if path.is_dir() and not command.pretrained:
         run = _load_with_code(path, command.recipe)
@@ -145,6 +149,7 @@ def _plan(command: commands.PlanCommand) -> Result:
 
 
 def _plot(command: commands.PlotCommand) -> Result:
+    """Carry out ``skillweave plot``: figures of one run or of several."""
     runs = open_runs(command.runs)
     of_several = (command.metric, command.agent, *command.label)
     if len(runs) == 1 and all(word is None for word in of_several) and command.band == "iqr":
@@ -169,6 +174,7 @@ def _plot(command: commands.PlotCommand) -> Result:
 
 
 def _report(command: commands.ReportCommand) -> Result:
+    """Carry out ``skillweave report``: the HTML report of a run."""
     run = RunDirectory.open(command.run)
     why_not = None
     trained = None
@@ -199,7 +205,7 @@ def _compare(command: commands.CompareCommand) -> Result:
 
 
 def _about(page: dict[str, Any]) -> Result:
-    """Return the result of a command that has written a page."""
+    """Return the result of a command that has written an HTML page."""
     lines = [page["verdict"].replace("`", "")] if "verdict" in page else []
     lines += [f"{page['path']}: {page['bytes'] / 1e6:.1f} MB, written in {page['seconds']:.1f} s"]
     lines += [f"missing: {line}" for line in page["missing"]]
@@ -207,6 +213,7 @@ def _about(page: dict[str, Any]) -> Result:
 
 
 def _list(command: commands.ListCommand) -> Result:
+    """Carry out ``skillweave list``: the shipped recipes, and the runs here."""
     shipped = []
     for name in recipes.names():
         weights = (recipes.source(name).with_suffix(".safetensors")).exists()
@@ -224,6 +231,7 @@ def _list(command: commands.ListCommand) -> Result:
 
 
 def _run_line(path: Path) -> dict[str, Any]:
+    """Return the entry of a run in the output of ``skillweave list``."""
     try:
         run = RunDirectory.open(path)
     except RunError as error:
@@ -235,6 +243,7 @@ def _run_line(path: Path) -> dict[str, Any]:
 
 
 def _info(command: commands.InfoCommand) -> Result:
+    """Carry out ``skillweave info``: a recipe's settings, or a run's content."""
     if not (Path(command.target) / "run.json").exists() and not Path(command.target).is_dir():
         settings = list_settings(recipes.load(command.target))
         text = "\n".join(f"{k}={v}" for k, v in settings.items())
@@ -247,7 +256,7 @@ def _info(command: commands.InfoCommand) -> Result:
 
 
 def _handover_lines(matrix: Handover | str | None) -> list[str]:
-    """Return the matrix of a run's log of calls, as lines."""
+    """Return the matrix of a run's log of calls, as lines of ``skillweave info``."""
     if matrix is None:
         return []
     if isinstance(matrix, str):
@@ -258,7 +267,7 @@ def _handover_lines(matrix: Handover | str | None) -> list[str]:
 
 
 def run_lines(manifest: Manifest, saved: Iterable[SavedEvaluation], target: object) -> list[str]:
-    """Return a run's manifest and its saved evaluations, as lines."""
+    """Return a run's manifest and saved evaluations, as lines that a command prints."""
     created = one_line(manifest.created)
     level = manifest.hierarchy
     lines = [f"{manifest.kind} on {one_line(manifest.env)}, seed {manifest.seed}, made {created}"]
@@ -317,6 +326,7 @@ def _weights(command: commands.WeightsCommand) -> Result:
 
 
 def _export(command: commands.ExportCommand) -> Result:
+    """Carry out ``skillweave export``."""
     if not command.onnx:
         raise DeclarationError("choose an export format: --onnx")
     name = Path(command.target).name.removesuffix(".safetensors")
@@ -326,6 +336,7 @@ def _export(command: commands.ExportCommand) -> Result:
 
 
 def _push(command: commands.PushCommand) -> Result:
+    """Carry out ``skillweave push``: upload a run to the hub."""
     _no_bars()
     pushed = push_run(command.run, command.name, command.private, command.calls)
     lines = [f"{pushed['url']}: {len(pushed['files'])} files", *pushed["missing"]]
@@ -341,7 +352,7 @@ def _pull(command: commands.PullCommand) -> Result:
 
 
 def _free_path(path: Path) -> Path:
-    """Return ``path``, or the first of path-2, path-3, … that does not exist."""
+    """Return a command's output ``path``, or the first of path-2, path-3 and so on that is free."""
     number = 1
     candidate = path
     while candidate.exists():
@@ -357,6 +368,7 @@ def _no_bars() -> None:
 
 
 def _import_agilerl(command: commands.ImportAgilerlCommand) -> Result:
+    """Carry out ``skillweave import-agilerl``: convert a checkpoint of AgileRL."""
     if not command.trust:
         raise DeclarationError(
             f"{command.file} would be read as a pickle, and pickles can run code. This one is read "
@@ -417,7 +429,7 @@ def _load_with_code(path: Path, recipe: str | None) -> Run:
 
 
 def _shipped(run: RunDirectory) -> str | None:
-    """Return a run's recipe if it is shipped, so that its code is trusted.
+    """Return a run's recipe for a command if it is shipped, so that its code is trusted.
 
     With it, the skills' rewards and successes are known.
     """

@@ -28,7 +28,7 @@ class ProcessEnded(TrainingError):
 
 
 class Processes:
-    """A pool of fresh processes, ``count`` at once; an error in its block ends them all."""
+    """A pool of fresh processes for a sweep's runs; an error in its block ends them all."""
 
     def __init__(self, count: int) -> None:
         self._threads = ThreadPoolExecutor(count)
@@ -45,6 +45,7 @@ class Processes:
         return self._threads.submit(self._run, job, arguments)
 
     def _run(self, job: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        """Run a job in a fresh process, and return its result."""
         receiver, sender = _START.Pipe(duplex=False)
         child = _START.Process(target=_answer, args=(sender, job, arguments))
         with self._lock:
@@ -89,7 +90,7 @@ class Processes:
 
 
 def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Do a job in its process, and send its result or its error."""
+    """Do a job of a sweep in its process, and send its result or its error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     when_parent_ends(lambda: os._exit(1))
     result: Any = None

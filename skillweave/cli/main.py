@@ -70,6 +70,7 @@ def _with_json(words: Sequence[str], stream: Any, alone: bool) -> int:
 
 
 def _main(words: Sequence[str], put: Put, alone: bool) -> int:
+    """Parse the words of a command line, carry out the command, return its exit code."""
     if list(words) == ["--version"]:
         from skillweave import __version__
 
@@ -117,7 +118,7 @@ def _main(words: Sequence[str], put: Put, alone: bool) -> int:
 
 @contextmanager
 def _short_interrupts(words: Sequence[str], put: Put) -> Iterator[None]:
-    """End the process at Ctrl-C within the block, in which large libraries are imported.
+    """End the command at Ctrl-C within the block, in which large libraries are imported.
 
     An exception in the middle of an import may be lost, or become another one.
     """
@@ -154,6 +155,7 @@ def _with_addresses(words: Sequence[str]) -> list[str]:
 
 
 def _fail(words: Sequence[str], put: Put, message: str, code: int) -> int:
+    """Print the error of a command, as JSON too if it is wanted; return the exit code."""
     if "--json" in words:
         with suppress(RunError):  # it is printed below as well
             put(as_json({"error": message}))
@@ -163,7 +165,7 @@ def _fail(words: Sequence[str], put: Put, message: str, code: int) -> int:
 
 
 def as_json(result: dict[str, Any]) -> str:
-    """Return a result as JSON, without any character that a terminal obeys; NaN becomes null."""
+    """Return a command's result as JSON that is safe for terminals; NaN becomes null."""
     try:
         text = json.dumps(result, default=str, allow_nan=False)
     except ValueError:
@@ -172,7 +174,7 @@ def as_json(result: dict[str, Any]) -> str:
 
 
 def _finite(data: Any) -> Any:
-    """Return data of JSON in which numbers that JSON lacks (NaN, infinity) are None."""
+    """Return data of a command's JSON in which NaN and infinity are None."""
     if isinstance(data, dict):
         return {key: _finite(value) for key, value in data.items()}
     if isinstance(data, list):

@@ -18,7 +18,7 @@ Result = tuple[dict[str, Any], str | None]
 
 
 def save_score(trained: Run, score: Evaluation, seed: int = 0, deterministic: bool = True) -> None:
-    """Keep a score in its run for ``info``; print a warning if it cannot be written."""
+    """Keep the score that a command prints in its run, for ``skillweave info``."""
     try:
         save_evaluation(RunDirectory.open(trained.path), score, seed, deterministic)
     except RunError as error:

@@ -50,7 +50,7 @@ _LINEAR = re.compile(r"[lL]inear\(([^,()]*,[^,()]*)\)")
 
 
 def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
-    """Change a declaration in place by ``name=value`` strings, in any order.
+    """Change a declaration in place by ``--set name=value`` strings, in any order.
 
     The name of an agent alone sets its algorithm: ``selector=DQN``, ``skills.center=SAC``.
 
@@ -87,7 +87,7 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
 
 
 def _split(setting: str, wrong: str) -> tuple[str, str]:
-    """Return name and value of ``name=value``; raise a DeclarationError ``wrong`` without them."""
+    """Return name and value of a ``--set name=value``; raise the error ``wrong`` without them."""
     name, sign, text = (part.strip() for part in setting.partition("="))
     if not sign:
         raise DeclarationError(wrong)
@@ -97,7 +97,7 @@ def _split(setting: str, wrong: str) -> tuple[str, str]:
 def _set_total(
     declaration: Declaration, total: int, before: int | None, parts: Sequence[str]
 ) -> None:
-    """Scale the budgets of a declaration that sets some itself, so that ``total`` is trained.
+    """Scale the budgets by ``--set steps=``, of a declaration that sets some itself.
 
     Args:
         before: the declaration's own ``steps``.
@@ -117,7 +117,7 @@ def _set_total(
 
 
 def list_settings(declaration: Declaration) -> dict[str, Any]:
-    """Return the dotted name and the value of every setting."""
+    """Return the dotted name and value of every setting that ``--set`` can change."""
     values: dict[str, Any] = {name: getattr(declaration, name) for name in PLAIN}
     for name, field in GROUPS.items():
         if (group := getattr(declaration, field)) is not None:
@@ -135,7 +135,7 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
 
 
 def _change(declaration: Declaration, owner: tuple[str, ...], changes: Changes) -> None:
-    """Change settings that names starting with ``owner`` belong to.
+    """Change by ``--set`` the settings whose names start with ``owner``.
 
     All at once: some fit only together (num_envs, batch_size).
     """
@@ -171,7 +171,7 @@ def _change(declaration: Declaration, owner: tuple[str, ...], changes: Changes) 
 def parse_evolve(
     settings: Sequence[str], declaration: Declaration, flat: bool
 ) -> dict[str, Evolution | None] | None:
-    """Return each stage's evolution, or None where nothing is to evolve.
+    """Return the evolution of each stage by ``--evolve``, or None where nothing is to evolve.
 
     A name may begin with a stage; settings without one hold for all. ``selection=truncation``
     takes that selection, ``ranges.gamma=0.9,0.999,complement`` lets a setting mutate.
@@ -203,7 +203,7 @@ def parse_evolve(
 
 
 def _evolution(settings: Changes) -> Evolution:
-    """Return an evolution with these settings."""
+    """Return the evolution that the ``--evolve`` options describe."""
     ranges: dict[str, Range] = {}
     changes: Changes = {}
     start = Evolution()
@@ -224,6 +224,7 @@ def _evolution(settings: Changes) -> Evolution:
 
 
 def _range(written: str, text: str) -> Range:
+    """Return the range that ``--evolve`` sets for a setting: low,high or low,high,scale."""
     try:
         low, high, *scale = (part.strip() for part in text.split(","))
         return Range(float(low), float(high), *scale)  # type: ignore[arg-type]
@@ -234,7 +235,7 @@ def _range(written: str, text: str) -> Range:
 
 
 def replaced(config: Any, changes: Changes) -> Any:
-    """Return ``config`` with the fields at these paths set to parsed values."""
+    """Return ``config`` with the fields that ``--set`` or ``--evolve`` names parsed and set."""
     known = [f.name for f in fields(config)]
     hints = annotations_of(type(config))
     values: dict[str, Any] = {}
@@ -262,7 +263,7 @@ def replaced(config: Any, changes: Changes) -> Any:
 
 
 def _parse(name: str, text: str, hint: Any) -> Any:
-    """Return the ``text`` of a setting as a value of the annotated type."""
+    """Return the text after ``--set name=`` as a value of the annotated type."""
     options = options_of(hint)
     if type(None) in options and text.lower() in ("none", "null"):
         return None
@@ -297,6 +298,7 @@ def _parse(name: str, text: str, hint: Any) -> Any:
 
 
 def _unknown(name: str, known: Sequence[str]) -> DeclarationError:
+    """Return the error for a name that ``--set`` or ``--evolve`` does not have."""
     last = ELSEWHERE.get(name, name)
     longer = [k for k in known if k.rpartition(".")[2] == last != k]
     if longer and name not in known:

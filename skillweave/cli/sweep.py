@@ -150,7 +150,7 @@ def sweep(command: commands.SweepCommand) -> Result:
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Return the seeds that "0:20" or "0,3,7" names."""
+    """Return the seeds of a sweep that "0:20" or "0,3,7" names."""
     try:
         if ":" in text:
             first, last = (int(part) for part in text.split(":"))
@@ -188,7 +188,7 @@ def parse_choices(each: Sequence[str]) -> list[tuple[str, ...]]:
 def _hierarchies(
     command: commands.SweepCommand, choices: Sequence[tuple[str, ...]]
 ) -> Iterator[tuple[str, Hierarchy]]:
-    """Yield for each choice its name, and the hierarchy with these settings."""
+    """Yield each choice of a sweep's settings by name, and the hierarchy with these."""
     for choice in choices:
         hierarchy = recipes.load(command.recipe)
         apply_overrides(hierarchy, [*command.set, *choice])
@@ -210,7 +210,7 @@ Tasks = Sequence[tuple[bytes, Job]]
 def _in_processes(
     tasks: Tasks, command: commands.SweepCommand
 ) -> Iterator[tuple[Job, float | str]]:
-    """Do each run in a process of its own, as many at once as there are cores."""
+    """Do each run of a sweep in a process, as many at once as there are cores."""
     with Processes(min(command.jobs or cores(), len(tasks))) as pool:
         due = {pool.submit(job.run, code): job for code, job in tasks}
         for future in as_completed(due):
@@ -222,7 +222,7 @@ def _in_processes(
 
 
 def _on_ray(tasks: Tasks, command: commands.SweepCommand) -> Iterator[tuple[Job, float | str]]:
-    """Do each run as a task of Ray; one whose machine is lost continues on another."""
+    """Do each run of a sweep as a task of Ray; one whose machine is lost continues on another."""
     cluster = Ray(address=command.ray or None)
     with cluster.joined(command.jobs or cores()) as ray:
         from skillweave.workers.actors import LOST, check_versions
@@ -254,7 +254,7 @@ def _on_ray(tasks: Tasks, command: commands.SweepCommand) -> Iterator[tuple[Job,
 
 
 def _task() -> Callable[..., Any]:
-    """Return the function that does a run on a node of Ray.
+    """Return the function that does a sweep's run on a node of Ray.
 
     It returns the node's versions where they do not fit, else None; and the run's result. It is
     sent to the nodes as code, so that it can report a node without Skillweave.
@@ -264,6 +264,7 @@ def _task() -> Callable[..., Any]:
     place = actor_class()()
 
     def task(job: tuple[Any, ...], code: bytes, good: Sequence[tuple[str, str]]) -> Any:
+        """Train one run of a sweep on a node of Ray; return its versions and the result."""
         versions = place.versions()
         if (versions["Skillweave"], versions["Python"]) not in good:
             return versions, None
@@ -305,6 +306,7 @@ def summary(results: Sequence[tuple[Job, float | str]], out: Path) -> Result:
 
 
 def _table(groups: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the lines of the table that ``sweep`` prints."""
     wide = max(len(g["settings"]) for g in groups)
     head = f"{'settings':<{wide}} {'runs':>5} {'return':>9} {'95 % interval':>20} {'median':>9}"
     lines = [f"{head} {'least to most':>20}"]
@@ -359,7 +361,7 @@ def must_be_same_code(out: Path, recipe: str) -> None:
 
 
 def code_files(recipe: Path) -> dict[str, Path]:
-    """Return a recipe's file, and by their names the user's modules that it imports.
+    """Return the recipe's file of a sweep, and by name the user's modules that it imports.
 
     Of a shipped recipe these are its parts.
     """

@@ -78,7 +78,7 @@ def _trained(
     evolve: dict[str, Evolution | None] | None = None,
     baseline: bool = False,
 ) -> Run:
-    """Train the hierarchy or its flat agent; a ``baseline`` starts with fresh weights."""
+    """Train a command's hierarchy or its flat agent; a ``baseline`` starts with fresh weights."""
     with _interruptible(command.ray):
         cluster = None if command.ray is None else Ray(command.collectors, command.ray or None)
         return hierarchy.train(
@@ -122,7 +122,7 @@ def _start_from(words: Sequence[str]) -> str | dict[str, str] | None:
 
 
 def _verdict(hierarchy: dict[str, Any], flat: dict[str, Any]) -> list[str]:
-    """Return in plain words which evaluation is better, and what that means."""
+    """Return in words for the terminal which evaluation is better, and what that means."""
     # Episodes that are all alike have no interval: they are one.
     (low, high), (flat_low, flat_high) = (
         score["ci95"] or (score["mean"], score["mean"]) for score in (hierarchy, flat)
@@ -144,7 +144,7 @@ def _verdict(hierarchy: dict[str, Any], flat: dict[str, Any]) -> list[str]:
 def _summary(
     command: commands.TrainCommand | commands.ResumeCommand, trained: Run, render: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the results of a run, for programs and for people."""
+    """Return the results that a training command prints, for programs and for people."""
     run = RunDirectory.open(trained.path)
     stages = run.manifest.stages
     result: dict[str, Any] = {"run": str(shown_path(trained.path)), "stages": as_json(stages)}

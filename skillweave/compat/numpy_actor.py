@@ -24,7 +24,7 @@ _LAYER = ("weight", "bias", "norm_weight", "norm_bias")
 
 
 class NumpyActor:
-    """The networks of a state of P = 1, as they are now: make a new one after learning.
+    """The networks of AgileRL's PPO (P = 1) in NumPy: make a new one after learning.
 
     MLPs are copied into NumPy; every other network without memory acts in torch.
     """

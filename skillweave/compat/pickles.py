@@ -121,7 +121,7 @@ def read_torch_pickle(path: Path) -> Any:
 
 
 def check_sizes(file: zipfile.ZipFile, size: int, program: str) -> None:
-    """Raise where reading a zip of ``size`` bytes would take far more memory than that."""
+    """Raise where reading a zip with a pickle would take far more memory than its size."""
     total = sum(member.file_size for member in file.infolist())
     if total > LARGEST:
         raise RunError(f"it declares {total:,} bytes; at most {LARGEST:,} are read")
@@ -189,7 +189,7 @@ def check_program(program: bytes) -> None:
 
 
 def _plain(data: Any) -> Any:
-    """Return a pickle's objects as plain tensors, Python numbers and containers."""
+    """Return a checkpoint's pickled objects as plain tensors, numbers and containers."""
     if isinstance(data, dict):
         return {_plain(key): _plain(value) for key, value in data.items()}
     if isinstance(data, list | tuple | set | frozenset):
@@ -202,6 +202,8 @@ def _plain(data: Any) -> Any:
 
 
 class _Unpickler(pickle.Unpickler):
+    """An unpickler of AgileRL's checkpoints that makes only plain things, and runs no code."""
+
     def __init__(self, data: Any, file: zipfile.ZipFile, prefix: str) -> None:
         super().__init__(data, encoding="utf-8")
         self._file = file
@@ -211,6 +213,7 @@ class _Unpickler(pickle.Unpickler):
         self._inert = type("Inert", (Inert,), {})
 
     def find_class(self, module: str, name: str) -> Any:
+        """Return what a pickle names, if it is allowed: a tensor, a number, a plain container."""
         module = module.replace("numpy._core", "numpy.core")
         if module == "torch" and name in _STORAGES:
             return _STORAGES[name]
@@ -223,6 +226,7 @@ class _Unpickler(pickle.Unpickler):
         return self._inert if allowed is Inert else _Call(allowed)
 
     def persistent_load(self, pid: Any) -> _Held:
+        """Return a tensor's storage that the pickle of a checkpoint refers to."""
         kind, dtype, key, _, size = pid
         if kind != "storage" or not isinstance(dtype, torch.dtype) or not isinstance(key, str):
             raise RunError(f"refused: the pickle refers to {shown(pid)}")
@@ -273,6 +277,7 @@ class _Array(np.ndarray[Any, Any]):
 
 
 def _create_array(make: Any, arguments: Any, state: Any, *_: Any) -> Any:
+    """Return a NumPy array as dill writes it into a pickle."""
     if not isinstance(make, _Call) or make._function is not _Array:  # dill writes arrays so
         raise RunError(f"refused: the pickle makes an array by {shown(make)}")
     array = _Array(*arguments)

@@ -245,6 +245,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         return array.reshape(())
 
     def _flag(self, value: Any, which: str) -> bool:
+        """Return ``terminated`` or ``truncated`` of an environment as a bool."""
         needed = "True or False"
         number = self._scalar(value, which, needed)
         if number not in (0, 1):
@@ -422,6 +423,7 @@ class Watch:
         return reached
 
     def _check(self, obs: Array, ids: Array) -> None:
+        """Check that all numbers in observations of environments ``ids`` are finite."""
         for place in self._places:
             part = at(obs, place)
             coarse = part.dtype.itemsize > 4
@@ -440,6 +442,7 @@ class Watch:
             self._bounds = None
 
     def _out_of_range(self, part: Array, place: tuple[str, ...], ids: Array) -> EnvError:
+        """Return the error for observations whose numbers are not finite, or too large."""
         bad = ~(np.abs(part) <= LARGEST_SEEN).reshape(len(part), -1)
         row = int(np.flatnonzero(bad.any(axis=1))[0])
         wrong = part[row].reshape(-1)[bad[row]]
@@ -465,6 +468,7 @@ class Watch:
         )
 
     def _wrong(self, row: int, ids: Array, what: str) -> EnvError:
+        """Return an error that names the environment and the step of its episode."""
         number = int(ids[row])
         step = int(self._elapsed[number])
         return EnvError(
@@ -501,6 +505,7 @@ def _fits(space: gym.Space[Any]) -> Callable[[Any], bool]:
     dtype = np.dtype(space.dtype)
 
     def fits(obs: Any) -> bool:
+        """Return whether an observation has the shape and type of its space."""
         if type(obs) is np.ndarray and obs.dtype == dtype:
             return bool(obs.shape == shape)
         try:
@@ -515,6 +520,7 @@ def _fits(space: gym.Space[Any]) -> Callable[[Any], bool]:
 
 
 def _holds(space: gym.Space[Any], obs: Any) -> bool:
+    """Return whether a space contains an observation; an exception means no."""
     try:
         obs = int(obs) if isinstance(obs, np.ndarray) and obs.shape == () else obs
         return bool(space.contains(obs))

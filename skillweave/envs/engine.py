@@ -313,6 +313,7 @@ class GymnasiumEngine(WatchedEngine):
         return self._begun(obs, batched_infos(infos), ids)
 
     def _act(self, action: Array, ids: Array) -> RawStep:
+        """Step environments ``ids`` (n,) one after another, and join their results."""
         assert not self._over[ids].any(), "an episode that is over must be reset first"
         n = len(ids)
         obs = self._empty(n)
@@ -388,6 +389,7 @@ class GymnasiumEngine(WatchedEngine):
             )
 
     def _made(self, make: Any, number: int) -> gym.Env[Any, Any]:
+        """Return a new environment; an error says how many could be made."""
         try:
             made: gym.Env[Any, Any] = make(number=number)
         except SkillweaveError as error:
@@ -405,6 +407,7 @@ class GymnasiumEngine(WatchedEngine):
         return np.zeros((n, *self._shape), self._dtype)
 
     def _check_alike(self, name: str) -> None:
+        """Raise an EnvError where the environments differ in their spaces, or are one object."""
         first = self.envs[0]
         for number, env in enumerate(self.envs):
             for kind in ("observation_space", "action_space"):
@@ -427,7 +430,7 @@ def episode_seed(root: int, row: int, episode: int) -> int:
 
 
 def checksums(obs: Array) -> Array:
-    """Return a checksum for each row of observations (n, *obs_shape), (n,) int64."""
+    """Return a checksum for each row of an engine's observations, (n,) int64."""
     sums = [0] * len(obs)
     for part in leaves(obs):
         rows = (np.ascontiguousarray(row).tobytes() for row in part)

@@ -138,6 +138,7 @@ class ActionMasks:
         self.now = now
 
     def _checked(self, value: Any, shape: tuple[int, int]) -> Array:
+        """Return an action mask from an environment's info as bool; check its shape."""
         mask = np.asarray(value)
         if mask.shape != shape or mask.dtype.kind not in "iubf":
             raise EnvError(

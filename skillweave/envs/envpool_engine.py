@@ -145,6 +145,8 @@ class EnvPoolEngine(WatchedEngine):
         self._pools = []
 
     def _begin(self, ids: Array) -> Array:
+        """Reset environments ``ids`` in their pools."""
+
         def reset(pool: Any, part: Array) -> tuple[Any, ...]:
             obs, info = pool.reset(ids[part].astype(np.int32))
             return pack(self.observation_space, obs), info
@@ -153,6 +155,7 @@ class EnvPoolEngine(WatchedEngine):
         return self._begun(obs, info, ids)
 
     def _act(self, action: Array, ids: Array) -> RawStep:
+        """Step environments ``ids`` in their pools."""
         if self._discrete:
             action = action.astype(np.int32)
 

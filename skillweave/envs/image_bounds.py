@@ -80,6 +80,7 @@ class ImageBounds:
         return self._looks > 0 and bool(self._images)
 
     def _notice(self, image: _Image) -> None:
+        """Give a notice of an image whose values do not fit the bounds of its space."""
         # Rounded, so environments of training and of evaluations give the same sentence.
         least, largest = image.seen
         if image.scaled[1] > 1.0 + BEYOND:

@@ -87,6 +87,7 @@ def _in_order(ids: Array, parts: Sequence[tuple[Array, Array]]) -> Array:
 
 
 def _joined(steps: Sequence[RawStep], counts: Sequence[int]) -> RawStep:
+    """Return one result of a step, joined of those of several engines."""
     if len(steps) == 1:
         return steps[0]
     return RawStep(

@@ -200,6 +200,7 @@ class EnvSpec:
     def _from_registry(
         self, env_id: str, render_mode: str | None, kwargs: dict[str, Any]
     ) -> gym.Env[Any, Any]:
+        """Make an environment by its Gymnasium id; an error names what is not installed."""
         try:
             try:
                 return gym.make(env_id, render_mode=render_mode, **kwargs)
@@ -366,7 +367,7 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
 
 
 def _alike(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
-    """Return whether spaces have the same kind, shape and type, and their parts by name, too."""
+    """Return whether spaces of an environment and its pool have the same kind, shape and type."""
     if not isinstance(a, type(b)) or a.shape != b.shape or a.dtype != b.dtype:
         return False
     ones, others = parts(a) or {}, parts(b) or {}

@@ -143,6 +143,7 @@ class _OneOfPool(gym.Env[Any, Any]):
         self._ids = np.zeros(1, np.int32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Reset the one environment of the pool."""
         super().reset(seed=seed)
         if seed is not None or self._pool is None:
             new = int(self.np_random.integers(POOL_SEEDS)) if seed is None else seed % POOL_SEEDS
@@ -151,6 +152,7 @@ class _OneOfPool(gym.Env[Any, Any]):
         return self._seen(obs), first_row(info)
 
     def step(self, action: Any) -> Any:
+        """Step the one environment of the pool."""
         if self._pool is None:
             raise gym.error.ResetNeeded("call reset() before step()")
         many = np.asarray(action, self.action_space.dtype)[None]
@@ -161,6 +163,7 @@ class _OneOfPool(gym.Env[Any, Any]):
         return self._seen(obs), float(reward[0]), *ends, first_row(info)
 
     def render(self) -> Any:
+        """Return a picture of the one environment of the pool."""
         if self.render_mode is None or self._pool is None:
             return None
         if not hasattr(self._pool, "render"):

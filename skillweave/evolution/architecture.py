@@ -117,7 +117,7 @@ def _steps(size: int, by: int, limits: tuple[int, int]) -> list[int]:
 
 
 def _fits(config: AlgorithmConfig, by: int, mutations: Mutations) -> bool:
-    """Return whether a layer can be added or removed."""
+    """Return whether a mutation can add or remove a layer."""
     network = config.network
     fewest = mutations.layers[0]
     behind = len(network.hidden) - getattr(config, "dueling", False)
@@ -138,7 +138,7 @@ def _cnn(member: Member, spaces: Any) -> CNN | None:
 
 
 def changed(network: Network, change: Change, cnn: CNN | None, dueling: bool) -> Network:
-    """Return the network after a change; ``cnn`` is its current encoder of images."""
+    """Return a member's network after a change; ``cnn`` is its current encoder of images."""
     if change.kind == "channels":
         assert cnn is not None
         new = tuple(c + change.by * (i == change.layer) for i, c in enumerate(cnn.channels))
@@ -202,7 +202,7 @@ def _carried(
 
 
 def _parts_of(net: Any, change: Change) -> Sequence[Units | Joint | str]:
-    """Return the parts of a network that a mutation changes: units, the last layer, or filters."""
+    """Return the parts of a member's network that a mutation changes: units, layer, filters."""
     if change.kind == "layer":
         joint = joint_of(net)
         return [joint] * (change.by > 0 or joint.depth > 1)
@@ -245,7 +245,7 @@ PAIRED: tuple[Activation, ...] = ("silu", "gelu")
 
 
 def fresh(named: Views, units: Units, extra: int, generator: torch.Generator) -> dict[str, Tensor]:
-    """Draw parameters of ``extra`` new units, by name: He-normal weights, biases zero.
+    """Draw a mutation's ``extra`` new units, by parameter: He-normal weights, biases zero.
 
     The deviations of noisy weights are the mean of the existing ones.
     """
@@ -265,7 +265,7 @@ def fresh(named: Views, units: Units, extra: int, generator: torch.Generator) ->
 
 
 def widened(named: Views, units: Units, extra: int, new: Views | None) -> dict[str, Tensor]:
-    """Add ``extra`` units with outgoing weights of zero; ``new`` None: zeros, for moments."""
+    """Add a mutation's ``extra`` units with outgoing weights of zero; ``new`` None: moments."""
     grown = dict(named)
     for part in (*units.own, *units.onward):
         old = grown[part.name]
@@ -383,7 +383,7 @@ def _renamed(named: Views, joint: Joint, by: int) -> dict[str, Tensor]:
 
 
 def _moved(name: str, joint: Joint, by: int) -> str:
-    """Return a parameter's new name: the head is the layer after the hidden ones."""
+    """Return a parameter's new name after a mutation: the head follows the hidden layers."""
     head = f"{joint.prefix}.{joint.depth}."
     if not name.startswith(head):
         return name

@@ -258,7 +258,7 @@ class Evolution:
 
 
 def evolution_to_json(evolution: Evolution) -> dict[str, Any]:
-    """Convert to plain JSON; a selection of the user becomes its name."""
+    """Convert an evolution to plain JSON; a selection of the user becomes its name."""
     data = asdict(evolution)
     data["selection"] = {"kind": type(evolution.selection).__name__}
     if isinstance(evolution.selection, Tournament | Truncation):

@@ -84,7 +84,7 @@ def join(
     spaces: tuple[Any, Any],
     made: dict[AlgorithmConfig, Algorithm] | None = None,
 ) -> tuple[Algorithm, Any]:
-    """Return the algorithm of the widest network, and one state of P members; copies.
+    """Return a stack of members: the algorithm of the widest network, and one state; copies.
 
     ``made`` caches algorithms, so that a compiled one need not be compiled again.
     """

@@ -238,7 +238,7 @@ def _rows_or_none(x: Tensor | None) -> Array | None:
 
 
 def _spread(x: Array | None, rows: Array, n: int) -> Any:
-    """Return arrays of n environments that hold ``x`` in ``rows``, and elsewhere its first row."""
+    """Return a collector's arrays of n environments: ``x`` in ``rows``, elsewhere its first row."""
     if x is None:
         return x
     whole = np.repeat(x[:1], n, axis=0)

@@ -541,7 +541,7 @@ def as_numbers(x: Array) -> Array:
 
 
 def _check_fits(name: str, saved: Array, like: Array) -> None:
-    """Raise a RunError where an array of a checkpoint has another shape or type than ``like``."""
+    """Raise a RunError where a collector's array in a checkpoint is of another shape or type."""
     found = as_numbers(saved)
     own = as_numbers(like)
     if found.shape != own.shape or found.dtype != own.dtype:

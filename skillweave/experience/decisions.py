@@ -260,7 +260,7 @@ DECIDED_ON = {
 
 
 def as_logits(chances: Array, may: Array) -> Array:
-    """Return the logits of a guide's choices, of which a small share is uniform.
+    """Return a guide's choices in rows as logits, of which a small share is uniform.
 
     Args:
         chances: (…, choices).

@@ -148,7 +148,7 @@ def split_states(state: dict[str, Array], count: int) -> list[dict[str, Array]]:
 
 
 def share_of(num_envs: int, workers: int, members: int, name: str) -> int:
-    """Return the number of environments of each of ``workers``; every member's are shared equally.
+    """Return the number of environments of each of several collectors, equally for members.
 
     Raises:
         DeclarationError: they cannot be.

@@ -81,6 +81,8 @@ def own_memory(memory: Memory) -> Memory:
 
 
 def _worth(critic: Acting) -> Callable[[Array], Array]:
+    """Return a function of observations: the values of skills by the learning skill critic."""
+
     def worth(obs: Array) -> Array:
         """Return the values of skills in observations (n, …), and of a new decision, (n, S + 1)."""
         found = critic.some(np.arange(len(obs)), obs, None, None).dist_params

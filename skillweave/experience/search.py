@@ -78,7 +78,7 @@ class Starts:
 
 
 class Search:
-    """Search for where a skill may start, in N environments.
+    """The search for where a skill may start, in a collector's N environments.
 
     It calls skills at random wherever they may start, and acts at random where none may. These
     skills sample, as a greedy skill may go round in circles forever. Where skills are named, all

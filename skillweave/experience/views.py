@@ -30,7 +30,7 @@ AT_ONCE = 1 << 26
 def seen_by(
     skill: Skill, step: Step, elapsed: Array, rows: Array | None = None, goal: Array | None = None
 ) -> Step:
-    """Return a step as a skill sees it, whose calls have their own time.
+    """Return a step of a trace as a skill sees it, whose calls have their own time.
 
     Where the environment is scored by a task, a skill sees the environment's own reward.
 
@@ -220,7 +220,7 @@ def rows_of(
 
 
 def info_numbers_of(trace: Trace, key: str) -> Array:
-    """Return a key of ``info`` in all steps, (T, N, …) numbers.
+    """Return a key of ``info`` in all steps of a trace, (T, N, …) numbers.
 
     Raises:
         EnvError: a step has no such key, or no number for each environment.
@@ -259,6 +259,7 @@ class JointInfo(Mapping[str, Any]):
         """A key was read that cannot be joined: it differs in its kind between steps."""
 
     def __getitem__(self, key: str) -> Any:
+        """Return a key of ``info`` of all rows, joined from the steps of a trace."""
         values = [info[key] for info in self._infos if key in info or isinstance(info, Infos)]
         if not values:
             raise KeyError(key)

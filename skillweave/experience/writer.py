@@ -68,7 +68,7 @@ class TraceWriter:
 
 
 def kept_info(info: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return an info that stays as it is: objects are copied, as environments may change them."""
+    """Return an environment's info for the trace: objects are copied, as they may change."""
     if all(isinstance(v, np.ndarray) and v.dtype != object for v in info.values()):
         return info
     kept = {key: _copied(value, key) for key, value in info.items()}
@@ -76,6 +76,7 @@ def kept_info(info: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _copied(value: Any, key: str) -> Any:
+    """Return a value of an ``info`` in a trace as a copy, as environments may change it."""
     if isinstance(value, np.ndarray) and value.dtype != object:
         return value
     if isinstance(value, dict):

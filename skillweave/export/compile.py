@@ -98,6 +98,7 @@ def _actions(policy: Policy, obs: Any) -> Any:
 
 
 def _hierarchy(policy: CallAndReturn, prefix: str, sampled: bool) -> CallAndReturn:
+    """Return a hierarchy's policy for an export: its networks are ONNX files."""
     guide = policy.guide
     if guide is not None:
         of = _compiled(guide.selector, f"{prefix}guide", sampled=False)
@@ -130,6 +131,7 @@ def _skill(skill: CalledSkill, prefix: str, knows: bool, *, sampled: bool) -> Ca
 
 
 def _interruption(how: Interruption | None, prefix: str) -> Interruption | None:
+    """Return the rule of interruption for an export, with the skill critic as an ONNX file."""
     if how is None or isinstance(how.worth, Critic):
         return how
     if not isinstance(how.critic, AgentPolicy):

@@ -99,7 +99,7 @@ class _Called(nn.Module):
 
 
 def _nested(space: gym.Space[Any], leaves: Iterator[Tensor], dtype: torch.dtype) -> Any:
-    """Return the leaves in the structure of the module's input."""
+    """Return the leaves in the structure of the input of an exported module."""
     inner = parts(space)
     if inner is None:
         return next(leaves).to(dtype)
@@ -108,7 +108,7 @@ def _nested(space: gym.Space[Any], leaves: Iterator[Tensor], dtype: torch.dtype)
 
 
 def _examples(policy: Mapped, space: gym.Space[Any]) -> dict[str, Tensor]:
-    """Return one example of each input of a model, by the name in the file."""
+    """Return one example of each input of a model to export, by the name in the file."""
     if policy.inputs is None:
         return examples(space)
     shapes = {name or OBS: given.shape for name, given in policy.inputs.items()}
@@ -116,6 +116,7 @@ def _examples(policy: Mapped, space: gym.Space[Any]) -> dict[str, Tensor]:
 
 
 def _module_model(policy: Mapped, own: TorchPolicy, where: str) -> Mapped:
+    """Return the model of a PyTorch module as an ONNX file, with its mapping."""
     space = own.observation_space
     given = _examples(policy, space)
     shapes = [tuple(1 if n is None else n for n in shape) for shape in own.mapping.state]
@@ -162,6 +163,7 @@ def _channels_first(x: Tensor, space: gym.Space[Any]) -> Tensor:
 
 
 def _sb3_model(policy: Mapped, own: SB3Policy, where: str) -> Mapped:
+    """Return the model of Stable-Baselines3 as an ONNX file, with its mapping."""
     space = own.observation_space
     given = _examples(policy, space)
     names = list(policy.inputs or ()) or [name.removeprefix(f"{OBS}.") for name in given]

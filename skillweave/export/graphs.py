@@ -34,7 +34,7 @@ OPSET = 18
 
 
 def examples(space: gym.Space[Any]) -> dict[str, Tensor]:
-    """Return one observation of zeros, by the names of the inputs that its leaves are."""
+    """Return one observation of zeros, by the names of an ONNX graph's inputs."""
     return {
         ".".join(("obs", *path)): torch.from_numpy(np.zeros((1, *leaf.shape), leaf.record))
         for path, leaf in space_of(space).leaves.items()
@@ -141,7 +141,7 @@ def in_env_units(algorithm: Algorithm, action: Tensor) -> Tensor:
 
 
 def _row(head: ActionHead | JointHead, action: Tensor) -> Tensor:
-    """Convert an action (1, …) with its parts to a row of numbers in the environment's units."""
+    """Convert an action (1, …) of a graph with its parts to a row of the environment's numbers."""
     if not isinstance(head, JointHead):
         return _in_env_units(head.codec, action, head.squash).reshape(1, -1).double()
     units = [head.codec.units(action, i) for i in range(len(head.heads))]
@@ -149,6 +149,7 @@ def _row(head: ActionHead | JointHead, action: Tensor) -> Tensor:
 
 
 def _in_env_units(codec: ActionCodec, action: Tensor, squash: bool) -> Tensor:
+    """Convert a policy's action, inside an ONNX graph, to the units of the environment."""
     space = codec.space
     shape = (1, *(space.shape or ()))
     dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
@@ -172,7 +173,7 @@ def _in_env_units(codec: ActionCodec, action: Tensor, squash: bool) -> Tensor:
 
 
 def _noise_of(algorithm: Algorithm) -> tuple[Any, ...]:
-    """Return the noise that an algorithm's ``act`` takes, for one observation."""
+    """Return the noise that an exported algorithm's ``act`` takes, for one observation."""
     noise = algorithm.noise([torch.Generator()], 1, 1)[0]
     if isinstance(noise, Tensor):
         if isinstance(algorithm.codec, JointCodec):
@@ -218,7 +219,7 @@ def traced(
 
 
 def _strip(graph: Any) -> None:
-    """Forget where each operation was written: paths of this machine, and half of the size."""
+    """Forget where an ONNX graph's operations were written: paths, and half of its size."""
     for part in (graph, *graph.node, *graph.value_info):
         part.ClearField("metadata_props")
     for node in graph.node:

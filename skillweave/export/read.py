@@ -39,7 +39,7 @@ from skillweave.spaces.saving import gym_space
 def read_policy(
     folder: Path, code: Mapping[str, Callable[..., Any]] | None = None, goal: Any = None
 ) -> Policy:
-    """Return the policy in a folder.
+    """Return the policy in an exported folder.
 
     Args:
         folder: has ``policy.json`` and ONNX files.
@@ -61,7 +61,7 @@ def read_policy(
 
 
 class Exported(Functional, Foreign):
-    """One policy of a folder; a run keeps a copy of all that it needs."""
+    """One policy of an exported folder; a run keeps a copy of all that it needs."""
 
     kind = "exported"
     suffix = ".zip"
@@ -168,6 +168,7 @@ def _skill_set(deployed: Deployed) -> SkillSet:
 
 
 def _policy(skill: CalledSkill, deployed: Deployed) -> Policy:
+    """Return the policy of a skill that was exported, to act or to be a skill again."""
     inside = Deployed(skill.policy, deployed.sees, deployed.acts)
     if isinstance(innermost(skill.policy), CallAndReturn):
         return ExportedHierarchy(inside, "")

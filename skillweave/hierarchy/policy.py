@@ -107,7 +107,7 @@ def with_interruption(skills: SkillSet, critic: Any, margin: float) -> SkillSet:
 
 
 class SkillAlone(Functional):
-    """Policy of one skill without a selector, with the reflexes in force.
+    """The policy of one skill of a hierarchy without the selector, with reflexes in force.
 
     It acts from an episode's start to its end, whatever its initiation set and ends. A skill that
     has goals is given one in each episode, by ``choose_goals``: the one of ``with_goal``, or one

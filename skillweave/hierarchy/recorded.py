@@ -113,7 +113,7 @@ def with_entry(level: Level, entry: LevelEntry) -> Level:
 
 
 def check_same_part(roles: Roles, entry: SkillEntry, where: str) -> None:
-    """Raise a RunError where a skill had another part of observations or actions.
+    """Raise a RunError where a skill's entry records another part of observations or actions.
 
     Args:
         roles: with the skill as it is declared now.
@@ -133,7 +133,7 @@ def check_same_part(roles: Roles, entry: SkillEntry, where: str) -> None:
 
 
 def check_selector(is_ready: bool, recorded: bool, where: str) -> None:
-    """Raise a RunError where one selector is ready and the other is trained."""
+    """Raise a RunError where of the recorded and the declared selector only one is ready."""
     if is_ready != recorded:
         kinds = ("a trained selector", "a ready one (a function, an automaton or a tree)")
         raise RunError(
@@ -143,7 +143,7 @@ def check_selector(is_ready: bool, recorded: bool, where: str) -> None:
 
 
 def check_guided(is_guided: bool, recorded: bool, where: str) -> None:
-    """Raise a RunError where only one of two selectors has a guide."""
+    """Raise a RunError where of the recorded and the declared selector only one has a guide."""
     if is_guided != recorded:
         has = ("no guide", "a guide")
         raise RunError(

@@ -144,7 +144,7 @@ def event_of(skill: Skill, done: Mapping[str, Any] | None) -> Callable[[Step], A
 
 
 def eager(skill: Skill, holds: Callable[[Step], Array], bonus: float, rest: float) -> Skill:
-    """Return a skill that is also paid while its event holds, so that it gets there quickly.
+    """Return a skill under repair, also paid while its event holds, so that it gets there fast.
 
     Its own reward may be content with a call that comes too late.
 
@@ -155,6 +155,7 @@ def eager(skill: Skill, holds: Callable[[Step], Array], bonus: float, rest: floa
     """
 
     def reward(self: Skill, step: Step) -> Array:
+        """Return the skill's reward with a bonus where the event of the repair holds."""
         own = skill.reward(step) if skill.defines("reward") else step.reward
         over = np.asarray(step.terminated, bool)
         if skill.defines("termination"):
@@ -169,7 +170,7 @@ def eager(skill: Skill, holds: Callable[[Step], Array], bonus: float, rest: floa
 
 
 class PairChoice(RandomChoice):
-    """A selector that calls one skill after each other one, and another one often before it.
+    """A selector that measures a repair: it calls one skill after each other, one often before it.
 
     Args:
         skills: names.
@@ -207,7 +208,7 @@ class PairChoice(RandomChoice):
 
 @dataclass(frozen=True)
 class Measured:
-    """A measurement of handovers."""
+    """A measurement of handovers before or after a repair."""
 
     matrix: Handover
     log: CallLog
@@ -231,7 +232,7 @@ def measure(
     num_envs: int,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Measured:
-    """Let skills act until one was called after another one often enough; return the handover.
+    """Measure a handover for a repair: let skills act until one followed the other often.
 
     Args:
         skills: of one level; ``skill`` and ``after`` are names there.
@@ -289,7 +290,7 @@ def measure(
 
 
 def _sum(one: Handover, other: Handover) -> Handover:
-    """Return the sum of two handover matrices of the same skills."""
+    """Return the sum of two handover matrices that are measured for a repair."""
     added = ("calls", "done", "began_late", "steps", "cut_else")
     counts = {k: getattr(one, k) + getattr(other, k) for k in added}
     limit = max(one.time_limit, other.time_limit)
@@ -332,7 +333,7 @@ def rehearsed_obs(
 
 
 def matrix_to_json(matrix: Handover) -> Matrix:
-    """Return a handover matrix as ``run.json`` records it."""
+    """Return a handover matrix as a repair's entry in ``run.json`` records it."""
     calls, done, late = (x.tolist() for x in (matrix.calls, matrix.done, matrix.began_late))
     needed = None if matrix.needed is None else matrix.needed.tolist()
     by_itself = list(matrix.by_itself)

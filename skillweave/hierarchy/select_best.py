@@ -82,7 +82,7 @@ def select_best(
 
 
 def _episodes(entry: StageEntry) -> int:
-    """Return the number of episodes of each candidate: fewer where episodes are long, or 0."""
+    """Return in how many episodes each candidate hierarchy is compared: fewer if long, or 0."""
     steps = entry.steps or 0
     length = entry.final.get("length") or steps / entry.num_envs
     episodes = round(SHARE * steps / length)
@@ -99,7 +99,7 @@ def _scores(
     after: Policies,
     episodes: int,
 ) -> dict[str, Evaluation]:
-    """Return the evaluations of all candidates, hierarchies before and after a stage, by name."""
+    """Return the evaluations of all candidates for the hierarchy that a run ends with, by name."""
     entry = run.stage(join(level.path, TOGETHER))
     spec = roles.spec
     seed = SEEDS + run.manifest.seed
@@ -139,7 +139,7 @@ def _scores(
 
 
 def _best(scores: Mapping[str, Evaluation]) -> Candidate:
-    """Return the best candidate by mean return; a selector samples only if clearly better."""
+    """Return the best candidate hierarchy by mean return; sampling only if clearly better."""
     by_mean: list[Any] = sorted(scores, key=lambda name: -scores[name].mean)  # of equals the first
     greedy: Candidate = next(k for k in by_mean if k == "before" or not SAMPLING[k][1])
     first = scores[by_mean[0]]
@@ -155,7 +155,7 @@ def _is_clear(difference: float, score: Evaluation, error: float) -> bool:
 
 
 def _exploration(entry: StageEntry, scores: Mapping[str, Evaluation]) -> list[str]:
-    """Return a sentence if training episodes, with choices at random, were clearly the best."""
+    """Return a sentence if episodes of training beat all candidate hierarchies clearly."""
     final: Any = entry.final
     best = max(scores.values(), key=lambda score: score.mean)
     if "return_error" not in final:  # too few episodes have ended

@@ -43,7 +43,7 @@ def manifest(
     flat: bool | AlgorithmConfig = False,
     how: TrainDefaults | None = None,
 ) -> Manifest:
-    """Return the content of ``run.json`` for a new run of a declaration.
+    """Return the content of ``run.json`` for a new run of a declared hierarchy.
 
     Args:
         flat: a manifest of the flat baseline: with its own settings, or with these.
@@ -78,7 +78,7 @@ def manifest(
 
 
 def _check_log_calls(stages: Sequence[Stage], how: TrainDefaults) -> None:
-    """Raise a DeclarationError where calls cannot be logged as the settings say."""
+    """Raise a DeclarationError where calls cannot be logged in stages of a hierarchy."""
     if how.log_calls is None:
         if how.log_calls_info:
             raise DeclarationError(
@@ -133,7 +133,7 @@ def train(
 
 
 def _repaired(roles: Roles, course: Course, policies: Policies) -> Policies:
-    """Train, or finish training, the repairs of a run; return the policies that it ends with."""
+    """Train the repairs that a hierarchy's run records; return its policies after them."""
     run, done = course.run, course.done
     for entry in run.manifest.stages:
         if (repair := entry.repair) is None:

@@ -225,7 +225,7 @@ def _check_guide(level: Level, recorded: GuideEntry | None, where: str) -> None:
 
 
 def check_parts(roles: Roles, policy: HierarchyPolicy, where: str) -> None:
-    """Raise a RunError where a policy has not the spaces of its place.
+    """Raise a RunError where a part of a hierarchy's policy has not the spaces of its place.
 
     Selectors choose among their skills; all skills have the spaces of the first, or a part of the
     environment's. Without parts the environment is not needed.

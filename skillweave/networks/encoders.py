@@ -228,6 +228,7 @@ class CellsEncoder:
         return torch.cat(features, -1)
 
     def _image(self, views: Views, i: int, image: Tensor) -> Tensor:
+        """Encode one image of whole numbers (cells) by a table of its kinds."""
         cell = image.flatten(2)
         last = self._last[i].on(image.device)
         if cell.dtype != torch.uint8:  # may be below 0

@@ -146,6 +146,7 @@ class Net:
         )
 
     def _joined(self, views: Views, inputs: Inputs, extra: Tensor | None) -> Tensor:
+        """Join the vector, the encoders' outputs and extra inputs, for the hidden layers."""
         parts = [self._seen(inputs["vector"])] if self._vector else []
         if self.encoders:
             parts += [e(part(views, prefix), inputs) for prefix, e in self.encoders.items()]

@@ -103,6 +103,7 @@ class _ClampInward(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        """Return the gradient without the part that leads further out of the bounds."""
         (x,) = ctx.saved_tensors
         (low, high) = ctx.bounds
         # A gradient step moves against the gradient.

@@ -38,6 +38,7 @@ class Seen:
 
     @cached_property
     def _ends(self) -> tuple[Tensor, Tensor]:
+        """Return the least and the largest number that give no notice, by those seen."""
         width = BEYOND * (self.high - self.low)
         away = CLIP * scale_of(self.mean, self.var)
         low = self.low - width

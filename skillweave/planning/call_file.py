@@ -151,7 +151,7 @@ def _columns(
     observation: gym.Space[Any],
     action: gym.Space[Any],
 ) -> dict[str, Array]:
-    """Return the columns, each of the type, shape and range that it must have."""
+    """Return the columns of a log's file, each of the type, shape and range that it must have."""
     of = {name: tuple(x.shape) for name, x in tensors.items()}
     calls, steps = (math.prod(of.get(name, ())) for name in ("choice", "reward"))
     choices = len(header.skills) * max(1, len(header.lengths))
@@ -185,7 +185,7 @@ def _columns(
 def _column(
     name: str, tensor: Tensor, dtype: Any, shape: tuple[int, ...], low: float, high: float
 ) -> Array:
-    """Return a column; a ValueError says what is wrong.
+    """Return a column of a log's file; a ValueError says what is wrong.
 
     Args:
         dtype: None: any numbers. A structured one is read from the bytes of its rows.

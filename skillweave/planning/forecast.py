@@ -433,7 +433,7 @@ def _follow(
 
 
 def _pooled(halves: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
-    """Return the bounds of the mean of independent chances, each given with its bounds."""
+    """Return the bounds of a forecast: the mean of independent chances with their bounds."""
     chance, low, high = np.array(halves).T
     below = np.sqrt(np.square(chance - low).sum()) / len(chance)
     above = np.sqrt(np.square(high - chance).sum()) / len(chance)

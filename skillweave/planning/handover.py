@@ -450,7 +450,7 @@ def happened(log: CallColumns, event: Event) -> Array:
 
 
 def wilson(successes: Any, trials: Any) -> tuple[Array, Array]:
-    """Return the bounds of 95 % intervals of shares (Wilson 1927, "Probable inference").
+    """Return the bounds of 95 % intervals of shares, such as handover rates (Wilson 1927).
 
     Args:
         successes: counts.

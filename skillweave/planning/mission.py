@@ -36,21 +36,21 @@ MOST_ARROWS = 100_000
 
 @dataclass(frozen=True)
 class InOrder:
-    """Parts that must be done one after another."""
+    """Parts of a mission that must be done one after another."""
 
     parts: tuple[Part, ...]
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Parts of which one must be done."""
+    """Parts of a mission of which one must be done."""
 
     parts: tuple[Part, ...]
 
 
 @dataclass(frozen=True)
 class AnyOrder:
-    """Parts that must all be done, in any order."""
+    """Parts of a mission that must all be done, in any order."""
 
     parts: tuple[Part, ...]
 
@@ -59,7 +59,7 @@ Part = Event | InOrder | Choice | AnyOrder
 
 
 def sequence(parts: Sequence[Part]) -> Part:
-    """Return parts one after another; sequences among them are joined.
+    """Return parts of a mission one after another; sequences among them are joined.
 
     Raises:
         DeclarationError: they are too many.
@@ -180,7 +180,7 @@ def in_any_order(*parts: Any) -> AnyOrder:
 
 
 def _needed(part: Part) -> Iterator[Predicate]:
-    """Yield the predicates that hold in every way to do a part."""
+    """Yield the predicates that hold in every way to do a part of a mission."""
     if isinstance(part, InOrder | AnyOrder):
         for inner in part.parts:
             yield from _needed(inner)
@@ -189,7 +189,7 @@ def _needed(part: Part) -> Iterator[Predicate]:
 
 
 def _several(parts: Sequence[Any], where: str) -> tuple[Part, ...]:
-    """Return the parts of a choice, or of one in any order, checked."""
+    """Return the parts of a mission's choice, or of one in any order, checked."""
     if not 2 <= len(parts) <= MOST_TOGETHER:
         raise DeclarationError(
             f"{where} has {len(parts)} part{'' if len(parts) == 1 else 's'}; give 2 to "
@@ -253,7 +253,7 @@ def as_task(value: Any, predicates: Mapping[str, Any] | None = None) -> Task:
 
 @dataclass(frozen=True)
 class _Fragment:
-    """A machine in the making: state 0 is its start, the last one its end.
+    """A mission's machine in the making: state 0 is its start, the last one its end.
 
     Args:
         arrows: the arrows that leave each state but the last.
@@ -300,7 +300,7 @@ def _in_order(part: Part) -> tuple[Part, ...]:
 
 
 def _unique(waits: Sequence[str]) -> tuple[str, ...]:
-    """Return names of states: what each waits for, with a number where two wait for the same."""
+    """Return names of a mission's states: what each waits for, with a number where two do."""
     names = dict.fromkeys((DONE, FAILED))
     number = dict.fromkeys(waits, 1)
     for wait in waits:
@@ -325,7 +325,7 @@ def _fragment(part: Part) -> _Fragment:
 
 
 def _in_sequence(parts: Sequence[_Fragment]) -> _Fragment:
-    """Join the end of each fragment to the start of the next; all use the same counters."""
+    """Join each fragment of a mission's machine to the next; all use the same counters."""
     _check_size(sum(p.end for p in parts), sum(len(a) for p in parts for a in p.arrows))
     arrows: list[tuple[Arrow, ...]] = []
     worth: list[float] = []
@@ -350,7 +350,7 @@ def _in_sequence(parts: Sequence[_Fragment]) -> _Fragment:
 
 
 def _together(parts: Sequence[_Fragment], first_ends: bool) -> _Fragment:
-    """Run fragments side by side, each with counters of its own, until one or all have ended."""
+    """Run a mission's fragments side by side, with own counters, until one or all have ended."""
     offsets = [0, *itertools.accumulate(p.slots for p in parts)]
     start = (0,) * len(parts)
     numbers = {start: 0}
@@ -442,7 +442,7 @@ def _check_successions(parts: Sequence[Any], again: bool) -> None:
 
 
 def _is_one_visit(a: Part, b: Part) -> bool:
-    """Return whether one step would do both parts: the same predicate of observations.
+    """Return whether one step would do both parts of a mission: the same predicate.
 
     A predicate of a step may mean a change, which does not happen twice.
     """

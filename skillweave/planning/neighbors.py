@@ -191,7 +191,7 @@ class FeatureMap:
 
 @lru_cache(64)
 def tie_order(count: int) -> Array:
-    """Return the order in which equally near points count, (count,) int64.
+    """Return the order in which equally near logged calls count, (count,) int64.
 
     It is by chance, but always the same: those of one part of a log would resemble one another.
     """

@@ -40,7 +40,7 @@ from skillweave.spaces import same_space
 
 
 class RandomChoice(RowPolicy):
-    """A selector that chooses uniformly among what may start.
+    """A selector for ``record_calls`` that chooses uniformly among what may start.
 
     Args:
         choices: the number of choices.

@@ -22,7 +22,7 @@ MASK = "action_mask"
 
 @dataclass(eq=False)
 class Deployed:
-    """A policy with the spaces of its environment."""
+    """A policy of plain data, with the spaces of its environment."""
 
     policy: RowPolicy
     sees: Space
@@ -30,7 +30,7 @@ class Deployed:
 
 
 class Actor:
-    """A policy in one environment, with its memory.
+    """A policy that acts in one environment, for ``Player`` and exported folders.
 
     Args:
         deployed: the policy.

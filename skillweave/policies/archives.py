@@ -76,6 +76,7 @@ def numbers_in(content: bytes) -> Array:
 
 
 def _array(content: bytes) -> Array:
+    """Return the array in the bytes of a ``.npy`` file; check type and size."""
     # It refuses objects. It takes the memory of the shape first, but touches only what it has read.
     stream = io.BytesIO(content)
     array: Array = np.lib.format.read_array(stream)
@@ -88,7 +89,7 @@ def _array(content: bytes) -> Array:
 
 
 def _is_plain(dtype: np.dtype[Any]) -> bool:
-    """Return whether all of a type are numbers, perhaps in records."""
+    """Return whether an array's type in a file is numbers, perhaps in records."""
     inner, _ = dtype.subdtype or (dtype, ())
     if inner.names is None:
         return inner.kind in "biuf" and inner.itemsize > 0
@@ -96,7 +97,7 @@ def _is_plain(dtype: np.dtype[Any]) -> bool:
 
 
 def _leaves(x: Array) -> Iterator[Array]:
-    """Yield the parts of records, which are numbers."""
+    """Yield the parts of the records of a NumPy array from a file, which are numbers."""
     if x.dtype.names is None:
         yield x
         return

@@ -27,7 +27,7 @@ Values = Mapping[str, Any]
 
 
 def cost(kind: type[Any], values: Values) -> int:
-    """Return about how many bytes an object takes while its policy acts in one environment.
+    """Return about how many bytes an object of a policy's file takes while it acts.
 
     Objects in it are not counted.
     """
@@ -36,6 +36,7 @@ def cost(kind: type[Any], values: Values) -> int:
 
 
 def _space(values: Values) -> int:
+    """Return the bytes of a space in a policy's file."""
     if values.get("parts") is not None:
         return 0
     size: int = prod(values.get("shape", ()))
@@ -54,6 +55,7 @@ def _deployed(values: Values) -> int:
 
 
 def _network(values: Values) -> int:
+    """Return the bytes of a network in a policy's file, with its session of onnxruntime."""
     noise = sum(max(0, width) for _, width in values.get("noise", ()))
     memory: int = values.get("memory", 0)
     choices: int = values.get("choices", 0)
@@ -86,6 +88,7 @@ def _automaton(values: Values) -> int:
 
 
 def _options(values: Values) -> int:
+    """Return the bytes of the options of a plan in a policy's file."""
     found = 0
     widest = max((aims.shape[-1] for aims in values["aims"] if np.ndim(aims)), default=1)
     for group in values["groups"]:
@@ -96,6 +99,7 @@ def _options(values: Values) -> int:
 
 
 def _planned(values: Values) -> int:
+    """Return the bytes of a planned selector in a policy's file."""
     options = values["options"]
     widest = max((aims.shape[-1] for aims in options.aims if aims is not None), default=1)
     features = max((len(one.places) for one in values["features"]), default=0)

@@ -57,7 +57,7 @@ OTHERS = (parts.Given, parts.Viewed, plan.Near, selectors.Rule)
 
 @cache
 def kinds() -> dict[str, type[Any]]:
-    """Return the types that may be written, by name."""
+    """Return the types of policies and their parts that ``policy.json`` may name."""
     found = (x for room in ROOMS for x in vars(room).values() if isinstance(x, type))
     here = {room.__name__ for room in ROOMS}
     return {
@@ -72,7 +72,7 @@ def kinds() -> dict[str, type[Any]]:
 
 @dataclass
 class Written:
-    """Content that is written beside the tree."""
+    """The writer of a policy's tree as JSON, with the files and arrays that lie beside it."""
 
     files: dict[str, bytes] = field(default_factory=dict)
     arrays: dict[str, Array] = field(default_factory=dict)
@@ -83,7 +83,7 @@ class Written:
     """The most numbers of an array in the tree."""
 
     def tree(self, value: Any, path: str = "", own: Field[Any] | None = None) -> Any:
-        """Return a value as JSON.
+        """Return a value of a policy's tree as JSON.
 
         Args:
             path: of the skill that it belongs to: ``landing``, or ``outer/landing``.
@@ -116,6 +116,7 @@ class Written:
         raise PolicyError(f"{path or 'the policy'} has {kind.__name__}, which cannot be written")
 
     def _object(self, value: Any, path: str) -> dict[str, Any]:
+        """Return a policy, or a part of one, as JSON: its type, and fields without defaults."""
         entry: dict[str, Any] = {"type": type(value).__name__}
         if isinstance(value, hierarchy.CalledSkill | parts.Override):
             name = value.name
@@ -136,6 +137,7 @@ class Written:
         return {"array": self.tree(value.tolist(), path), "dtype": str(value.dtype)}
 
     def _function(self, value: Any, path: str, own: Field[Any]) -> str:
+        """Return the name under which ``policy.json`` lists a user's function."""
         bare = getattr(value, "bare", value)
         label = own.metadata.get("label") or getattr(bare, "__name__", type(bare).__name__)
         alone = path.rpartition("/")[2] == label  # of a selector that is a function
@@ -145,7 +147,7 @@ class Written:
         return name
 
     def content(self) -> dict[str, bytes]:
-        """Return the files, with one of the arrays."""
+        """Return the files that lie beside ``policy.json``, with one of the arrays."""
         if not self.arrays:
             return self.files
         buffer = io.BytesIO()
@@ -154,7 +156,7 @@ class Written:
 
 
 def _free(table: dict[str, Any], wanted: str, value: Any) -> str:
-    """Return the name of a value in a table; a second value of a name gets a number."""
+    """Return the name of a value beside ``policy.json``; a second value of it gets a number."""
     stem, dot, suffix = wanted.rpartition(".") if wanted.endswith(".onnx") else (wanted, "", "")
     tried = (wanted if i == 1 else f"{stem}#{i}{dot}{suffix}" for i in range(1, 10_000))
     name = next(n for n in tried if table.get(n, value) is value)
@@ -174,7 +176,7 @@ def _below(path: str, name: str) -> str:
 
 @cache
 def written_fields(kind: Any) -> dict[str, tuple[Field[Any], Any]]:
-    """Return the fields of a type that are written, each with the kind of its values, by name."""
+    """Return the fields of a type that ``policy.json`` has, and their kinds, by name."""
     hints = get_type_hints(kind)
     return {
         one.name: (one, one.metadata.get("kind", hints[one.name]))
@@ -188,7 +190,7 @@ def written_fields(kind: Any) -> dict[str, tuple[Field[Any], Any]]:
 
 @dataclass
 class Reader:
-    """Content that is read beside the tree."""
+    """The reader of a policy's tree from ``policy.json``, with the content beside it."""
 
     code: Mapping[str, Callable[..., Any]]
     files: Mapping[str, bytes]
@@ -198,7 +200,7 @@ class Reader:
     """The bytes that further objects may take."""
 
     def read(self, kind: Any, entry: Any, where: str) -> Any:
-        """Return the value of an entry, which must be of a kind: any annotation of a field.
+        """Return the value of an entry of ``policy.json``, which must be of a kind.
 
         Raises:
             PolicyError: it is not; the message names the place ``where``.
@@ -233,6 +235,7 @@ class Reader:
         return self._object(entry, where)
 
     def _object(self, entry: dict[str, Any], where: str) -> Any:
+        """Return a policy, or a part of one, from its JSON; check every field."""
         made: Any = kinds()[entry["type"]]
         own = written_fields(made)
         values = dict[str, Any]()
@@ -256,6 +259,7 @@ class Reader:
             raise PolicyError(f"{where}: {error}") from error
 
     def _array(self, entry: dict[str, Any], where: str) -> Array:
+        """Return an array of a policy from its JSON, or from the file of arrays."""
         if "stored" in entry:
             found: Array = self._beside(self.arrays, entry["stored"], where, ARRAYS)
             return found
@@ -279,6 +283,7 @@ class Reader:
         return found
 
     def _numbers(self, kind: type[Any], entry: Any, where: str) -> Any:
+        """Return the numbers of an array in ``policy.json``, nested as lists."""
         if isinstance(entry, list):
             return [self._numbers(kind, x, where) for x in entry]
         if kind is int and type(entry) is int:  # the array's type bounds it
@@ -305,7 +310,7 @@ def _types(kind: Any) -> dict[str, type[Any]]:
 
 
 def _fits(kind: Any, origin: Any, inner: tuple[Any, ...], entry: Any) -> bool:
-    """Return whether an entry has the form of a kind."""
+    """Return whether an entry of ``policy.json`` has the form of a kind."""
     if kind in PLAIN:
         return type(entry) is kind
     whole = type(entry) is int and abs(entry) < 2**63
@@ -330,7 +335,7 @@ def _fits(kind: Any, origin: Any, inner: tuple[Any, ...], entry: Any) -> bool:
 
 
 def _wanted(kind: Any, origin: Any, inner: tuple[Any, ...]) -> str:
-    """Return a description of the form of a kind, for messages."""
+    """Return a description of a kind's form in ``policy.json``, for messages."""
     plain: dict[Any, str] = {**PLAIN, int: "a whole number", float: "a number"}
     if kind in plain:
         return plain[kind]
@@ -413,7 +418,7 @@ FIELDS = {"env": str, "license": str, "origin": str, "files": dict, "code": dict
 
 
 class _Folder:
-    """The files of a folder, or of an archive of one."""
+    """The files of an exported policy's folder, or of an archive of one."""
 
     def __init__(self, folder: Path, archive: bytes | None) -> None:
         self.folder = folder
@@ -427,7 +432,7 @@ class _Folder:
                 raise RunError(f"the copy of {folder} is damaged: {error}") from error
 
     def read(self, name: str, most: int = MOST_FILES) -> bytes:
-        """Return a file.
+        """Return a file of an exported policy's folder.
 
         Raises:
             RunError: it is missing or too large, or all files together are.
@@ -445,7 +450,7 @@ class _Folder:
 
 
 def _check_code(folder: Path, listed: Mapping[str, str], given: Mapping[str, Any]) -> None:
-    """Raise a PolicyError that names listed functions which were not given."""
+    """Raise a PolicyError that names a policy's functions which were not given."""
     missing = [name for name in listed if name not in given]
     if missing:
         wanted = [f"{shown(x, 100)}: {shown_text(listed[x], 200)}" for x in missing[:MOST_SHOWN]]
@@ -457,7 +462,7 @@ def _check_code(folder: Path, listed: Mapping[str, str], given: Mapping[str, Any
 
 
 def _content(folder: Path, name: str, recorded: str, opened: _Folder) -> bytes:
-    """Return a file of a folder, compared with its checksum."""
+    """Return a file of an exported policy's folder, compared with its checksum."""
     plain = not set(name) & set("/\\\0") and not name.startswith(".")
     if not plain or not name.endswith((".onnx", ARRAYS)) or len(name) > LONGEST_NAME:
         raise RunError(f"{folder / MANIFEST}: files has {shown(name)}, no file of the folder")
@@ -471,7 +476,7 @@ def _content(folder: Path, name: str, recorded: str, opened: _Folder) -> bytes:
 
 
 def _archived(files: Mapping[str, bytes]) -> bytes:
-    """Return files as one, which has the same bytes each time."""
+    """Return the files of a policy as one zip, which has the same bytes each time."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name in sorted(files):
@@ -480,7 +485,7 @@ def _archived(files: Mapping[str, bytes]) -> bytes:
 
 
 def _arrays(content: bytes) -> dict[str, Array]:
-    """Return the arrays of a file ``arrays.npz`` by name."""
+    """Return a policy's arrays in the file ``arrays.npz`` by name."""
     found: dict[str, Array] = {}
     try:
         for name, data in unzipped(content, MOST_ARRAYS) if content else ():

@@ -38,7 +38,7 @@ RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = map(int, CallEnd)
 
 
 def end_with_episode(end: Array, over: Array) -> None:
-    """Set in ``end`` (n,) that episodes ended calls, but for those that ended by themselves.
+    """Set in ``end`` (n,) that episodes ended running calls, but for those that ended themselves.
 
     Args:
         over: (n,) bool, the episode is over.
@@ -99,7 +99,7 @@ def part_of(
     max_steps: int | None = None,
     goal: Array | None = None,
 ) -> Step:
-    """Return a step as a skill sees it, which counts its own steps and has its own limit.
+    """Return a step as an acting skill sees it, with steps and a limit of its own call.
 
     Args:
         elapsed: (m,) steps so far, this one included.
@@ -129,7 +129,7 @@ def part_of(
 
 
 def info_rows(info: Mapping[str, Any], rows: Array, n: int) -> dict[str, Any]:
-    """Return the part of ``rows`` (k,) of a batched info of n environments, nested dicts included.
+    """Return ``rows`` (k,) of a batched info, nested dicts too, for the policy that acts there.
 
     Values that are not arrays over the n environments are returned unchanged.
     """
@@ -151,7 +151,7 @@ SUCCESS = "success"
 
 
 def own_step(step: Step) -> Step:
-    """Return a step of a task's environment as the environment itself gave it.
+    """Return a task's step, for a policy that acts, as the environment itself gave it.
 
     A task's environment (``planning.task_env``) has the task's reward and success, and keeps the
     environment's own in ``info``. A step of another environment is returned unchanged.
@@ -344,7 +344,7 @@ def innermost(policy: RowPolicy) -> RowPolicy:
 
 
 def code(what: str, label: str = "", *, needed: bool = True) -> Any:
-    """Return a field that holds a function of the user, which exports name and do not write.
+    """Return a field of a policy with a user's function, which exports name and do not write.
 
     Args:
         what: what it takes and returns, for the list of functions that an export needs.
@@ -363,7 +363,7 @@ skill's path and the function's name, and returns its answer, (k,) bool."""
 def call_plainly(
     function: Callable[..., Any], about: Any, rows: Array, path: str, name: str
 ) -> Array:
-    """Call a function of a user without this library's long messages; a ``CallUser``.
+    """Call a function of a policy as exports do, without the library's long messages.
 
     Raises:
         SkillError: it did not return (k,) bool.
@@ -387,7 +387,7 @@ def observed(obs: Array) -> str:
 
 
 def put(memory: Memory, rows: Array, values: Memory) -> None:
-    """Write the memory of environments ``rows`` (k,) in place."""
+    """Write an acting policy's memory of environments ``rows`` (k,) in place."""
     for k, v in values.items():
         if isinstance(v, dict):
             put(memory[k], rows, v)
@@ -406,7 +406,7 @@ def restart(policy: RowPolicy, memory: Memory, rows: Array) -> None:
 
 
 def flat(memory: Memory, prefix: str = "") -> dict[str, Array]:
-    """Return the arrays of a memory, the same ones, by dotted names."""
+    """Return the arrays of a policy's memory, the same ones, by dotted names."""
     found: dict[str, Array] = {}
     for k, v in memory.items():
         found |= flat(v, f"{prefix}{k}.") if isinstance(v, dict) else {prefix + k: v}
@@ -414,7 +414,7 @@ def flat(memory: Memory, prefix: str = "") -> dict[str, Array]:
 
 
 def nested(like: Memory, arrays: Mapping[str, Array], prefix: str = "") -> Memory:
-    """Return arrays by dotted names as a memory with the names of ``like``; undoes ``flat``."""
+    """Return arrays by dotted names as a policy's memory, as of ``like``; undoes ``flat``."""
     return {
         k: nested(v, arrays, f"{prefix}{k}.") if isinstance(v, dict) else arrays[prefix + k]
         for k, v in like.items()
@@ -422,7 +422,7 @@ def nested(like: Memory, arrays: Mapping[str, Array], prefix: str = "") -> Memor
 
 
 def split(arrays: Mapping[str, Array]) -> Memory:
-    """Return arrays by dotted names as a memory; parts that remember nothing are left out."""
+    """Return arrays by dotted names as a policy's memory; empty parts are left out."""
     found: Memory = {}
     for name, value in arrays.items():
         *parts, last = name.split(".")

@@ -19,7 +19,7 @@ _PROGRAM: ContextVar[dict[str, Any] | None] = ContextVar("_PROGRAM", default=Non
 
 @contextmanager
 def usual_floats() -> Iterator[None]:
-    """Handle errors of floats as NumPy does by default, or ignore what the program ignores."""
+    """Handle NumPy's float errors while policies act: as by default, or as the program ignores."""
     now: dict[str, Any] = dict(np.geterr())
     usual: dict[str, Any] = {kind: "ignore" if now[kind] == "ignore" else "warn" for kind in now}
     usual["under"] = "ignore"
@@ -35,7 +35,7 @@ def usual_floats() -> Iterator[None]:
 
 
 def by_program(function: Callable[..., Any], *args: Any, **named: Any) -> Any:
-    """Return the result of a function of the program, with the handling that it has set."""
+    """Return the result of a program's function in a policy, with the float handling it has set."""
     program = _PROGRAM.get()
     if program is None:
         return function(*args, **named)

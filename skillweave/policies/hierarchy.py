@@ -57,7 +57,7 @@ TRIES = 16
 
 @dataclass(eq=False)
 class CallGoals:
-    """The goals of a skill's calls."""
+    """The goals that calls of an acting skill have, one for each call."""
 
     name: str
     """The skill's name, for messages."""
@@ -89,7 +89,7 @@ class CallGoals:
         return self.inside(goals, who)
 
     def inside(self, goals: Array, who: str) -> Array:
-        """Return goals (n, …) that are in the space.
+        """Return the goals (n, …) of an acting skill's calls, which are in its space.
 
         Raises:
             SkillError: one is not; ``who`` gave it.
@@ -117,7 +117,7 @@ class CallGoals:
 
 @dataclass(eq=False)
 class CalledSkill:
-    """A skill of a hierarchy: its policy, and when calls of it start and end."""
+    """A skill as ``CallAndReturn`` acts with it: its policy, and when calls of it start and end."""
 
     name: str
     path: str
@@ -146,7 +146,7 @@ class CalledSkill:
 
 @dataclass(eq=False)
 class Critic:
-    """A policy whose actions are the values of skills."""
+    """A policy whose actions are the values of skills, for an ``Interruption``."""
 
     policy: RowPolicy
 
@@ -565,7 +565,7 @@ class CallAndReturn(Choices, RowPolicy):
     def _interrupt(
         self, how: Interruption, memory: Memory, rows: Array, step: Step, end: Array
     ) -> None:
-        """End calls where a new decision is worth clearly more, in place.
+        """End running calls where a new decision is worth clearly more, in place.
 
         What a call is worth is that of its skill with its goal.
         """
@@ -626,7 +626,7 @@ class CallAndReturn(Choices, RowPolicy):
 
 
 def _by_skill(running: Array) -> Iterator[tuple[int, Array]]:
-    """Yield the skills that run, in order, and where they do in ``running`` (k,)."""
+    """Yield the skills that act, in order, and where they run in ``running`` (k,)."""
     present = sorted(set(running.tolist()))
     if len(present) == 1:
         yield present[0], np.arange(len(running))

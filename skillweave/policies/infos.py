@@ -100,7 +100,7 @@ class InfoKeys:
 
 
 def one_number(value: Any) -> float | None:
-    """Return the only number in a value: alone, in an array, a tensor or a list; None: it has none.
+    """Return the only number in a value of an info: alone or in an array; None: it has none.
 
     None and a NaN are the number that is not known, NaN.
     """
@@ -147,7 +147,7 @@ def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _column(rows: list[int], values: list[Any], n: int) -> Any:
-    """Return the values of n environments under one key as a column; ``rows`` have one."""
+    """Return the values of n environments under one key of their infos; ``rows`` have one."""
     kinds = set(map(type, values))
     if all(issubclass(kind, dict) for kind in kinds):
         inner: list[dict[str, Any]] = [{}] * n
@@ -172,7 +172,7 @@ def _column(rows: list[int], values: list[Any], n: int) -> Any:
 
 
 def _numbers(values: list[Any], *, mixed: bool) -> Array | None:
-    """Return numbers as an array; None: no type represents all of them exactly."""
+    """Return numbers of infos as an array; None: no type represents all of them exactly."""
     array = np.array(values)
     if array.dtype.kind not in "biufc":
         return None  # whole numbers that are too large
@@ -183,7 +183,7 @@ def _numbers(values: list[Any], *, mixed: bool) -> Array | None:
 
 
 def _stacked(values: list[Array]) -> Array | None:
-    """Stack arrays; None: no array represents all of them exactly."""
+    """Stack arrays of infos; None: no array represents all of them exactly."""
     first = values[0]
     if any(v.shape != first.shape for v in values):
         return None

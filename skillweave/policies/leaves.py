@@ -41,7 +41,7 @@ class Selector(RowPolicy):
         raise NotImplementedError
 
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
-        """Return the choices (k, choices) that it leaves, as far as known before it sees more."""
+        """Return the choices (k, choices) that the ready selector leaves, before it sees more."""
         allowed = self.allowed(memory, rows)
         if allowed is None:
             return may
@@ -212,6 +212,7 @@ class OnnxNetwork(RowPolicy):
         return bool(self.noise)
 
     def _run(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Run the ONNX file on observations ``obs`` of rows (k,); return its actions."""
         n = len(rows)
         feeds = {k: np.ascontiguousarray(at(obs, path)) for k, path in self._inputs.items()}
         if self.choices:

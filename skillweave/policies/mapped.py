@@ -41,7 +41,7 @@ NUMBERS: dict[str, type[np.generic]] = {
 
 @dataclass(eq=False)
 class Take:
-    """Some numbers of an input of a model, from one source.
+    """Numbers that an acting policy takes from one source, for an input of its model.
 
     Raises:
         PolicyError: its fields contradict each other.
@@ -141,7 +141,7 @@ def _one_hot(choice: Array, count: int) -> Array:
 def numbers_of(
     function: Callable[..., Any], obs: Array, who: str, shape: tuple[int, ...] | None = None
 ) -> Array:
-    """Return the numbers (n, ...) that a user's function makes of observations; (n,) as (n, 1).
+    """Return the numbers (n, ...) that a function makes for a model as it acts; (n,) as (n, 1).
 
     Raises:
         PolicyError: it returned something else, or another ``shape`` of one environment.
@@ -163,7 +163,7 @@ def numbers_of(
 
 @dataclass(eq=False)
 class Affine:
-    """A scaling of a whole input, ``(x - offset) * scale``, then clipped; None: not at all."""
+    """A scaling of an acting model's input, ``(x - offset) * scale``, clipped; None: not."""
 
     offset: Array | None = None
     scale: Array | None = None
@@ -181,7 +181,7 @@ class Affine:
 
 @dataclass(eq=False)
 class Input:
-    """One input of a model, joined of what is taken.
+    """One input of a model that acts, joined of what is taken.
 
     Raises:
         PolicyError: its fields contradict each other.
@@ -234,7 +234,7 @@ def clipped(x: Array, low: Array | float | None, high: Array | float | None) -> 
 
 
 def _check_sizes(one: Any, shape: tuple[int, ...], *names: str) -> None:
-    """Raise a PolicyError where a field is not None, one number, or numbers of a shape."""
+    """Raise a PolicyError where a scaling of an acting model is not one number, or of a shape."""
     for name in names:
         x = getattr(one, name)
         if x is not None and np.shape(x) not in ((), (1,), shape):
@@ -243,7 +243,7 @@ def _check_sizes(one: Any, shape: tuple[int, ...], *names: str) -> None:
 
 
 def check_places(places: tuple[int, ...], size: int, name: str, *, once: bool = False) -> None:
-    """Raise a PolicyError where a field names places beyond ``size``, or one twice (``once``)."""
+    """Raise a PolicyError where a policy's field names places beyond ``size``, or one twice."""
     within = bool(places) and 0 <= min(places) <= max(places) < size
     if not within or (once and len(set(places)) < len(places)):
         raise PolicyError(
@@ -257,7 +257,7 @@ def check_places(places: tuple[int, ...], size: int, name: str, *, once: bool = 
 
 @dataclass(eq=False)
 class Outputs:
-    """The meaning of a model's outputs, as actions of a space.
+    """The meaning of an acting model's outputs, as actions of a space.
 
     Raises:
         PolicyError: its fields contradict each other.
@@ -409,7 +409,7 @@ class Outputs:
 
 
 class Model:
-    """A model, which makes outputs of inputs."""
+    """A model from elsewhere as it acts: it makes outputs of inputs."""
 
     @property
     def expected(self) -> Shapes:
@@ -439,7 +439,7 @@ class Model:
 
 @dataclass(eq=False)
 class Function(Model):
-    """A user's function of inputs, perhaps with a state.
+    """A user's function of inputs as it acts, perhaps with a state.
 
     Raises:
         PolicyError: its fields contradict each other.
@@ -492,7 +492,7 @@ class Function(Model):
 
 
 def invoke(function: Any, inputs: dict[str, Any], state: Sequence[Any], single: bool) -> Any:
-    """Call a function or a module with inputs by name, or with the only one, and its state.
+    """Call an acting policy's function or module with its inputs and its state.
 
     Args:
         single: the state is one array; else a tuple.
@@ -504,7 +504,7 @@ def invoke(function: Any, inputs: dict[str, Any], state: Sequence[Any], single: 
 
 
 def parted(value: Any, declared: Any, who: str) -> tuple[Any, Sequence[Any]]:
-    """Return the output and the next state of what a function or a module has returned.
+    """Return output and next state of what an acting policy's function or module returned.
 
     Args:
         declared: has the fields ``state`` and ``single_state``.
@@ -535,7 +535,7 @@ def of_model(state: Sequence[Array], shapes: Sequence[tuple[int | None, ...]]) -
 def rows_first(
     state: Sequence[Array], shapes: Sequence[tuple[int | None, ...]], who: str
 ) -> tuple[Array, ...]:
-    """Return a model's state with the environments first; undo ``of_model``."""
+    """Return an acting model's state with the environments first; undo ``of_model``."""
     if len(state) != len(shapes):
         raise PolicyError(f"{who} returned {len(state)} arrays of state, but takes {len(shapes)}")
     for x, s in zip(state, shapes, strict=True):
@@ -551,7 +551,7 @@ def states_of(shapes: Sequence[tuple[int | None, ...]]) -> list[tuple[tuple[int,
 
 @dataclass(eq=False)
 class OnnxFile(Model):
-    """A model in ONNX's format, run by onnxruntime on the CPU.
+    """A model in ONNX's format as it acts, run by onnxruntime on the CPU.
 
     Raises:
         PolicyError: onnxruntime cannot run it, it has weights in other files, or its inputs and
@@ -689,7 +689,7 @@ class OnnxFile(Model):
 
 @dataclass(eq=False)
 class Mapped(RowPolicy):
-    """A model behind a mapping.
+    """A model behind a mapping, as a policy that acts.
 
     Its memory has, where the mapping needs them: ``state.0`` and following, the recurrent state;
     ``last``, the last output; ``phase``, the steps since the last inference; ``held``, its actions.
@@ -958,7 +958,7 @@ class Mapped(RowPolicy):
 
 
 def fits_shape(shape: tuple[int, ...], wanted: tuple[int | None, ...] | None) -> bool:
-    """Return whether a shape is the wanted one, None for any number, or for any shape."""
+    """Return whether a shape of a model's file is the wanted one; None: any number, or shape."""
     return wanted is None or (
         len(shape) == len(wanted)
         and all(b is None or a == b for a, b in zip(shape, wanted, strict=True))

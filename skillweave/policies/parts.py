@@ -44,7 +44,7 @@ def with_goal(sees: Space, goal: Space) -> Space:
 
 
 def joined(obs: Array, goal: Array, axes: int = 1) -> Array:
-    """Return records of observations and goals.
+    """Return records of observations and goals, as a policy for goals sees them.
 
     Args:
         obs: (…, *obs_shape).
@@ -70,7 +70,7 @@ def joint_dtype(
 
 @dataclass(eq=False)
 class Correction:
-    """Numbers that are added to the actions of a ready policy."""
+    """Numbers that a policy adds to the actions of a ready one."""
 
     step: Array
     """(…) the largest correction of each number."""
@@ -124,7 +124,7 @@ class Corrects(Around):
 
 @dataclass(eq=False)
 class Slice:
-    """The part of observations that a skill sees, and of actions that it writes.
+    """The part of observations and actions that is an acting skill's, as data of its policy.
 
     Raises:
         PolicyError: its fields contradict each other.
@@ -280,7 +280,7 @@ class Slice:
             )
 
     def filled(self, n: int, last: Array | None) -> Array:
-        """Return n new actions that hold the rest everywhere.
+        """Return n whole actions that a skill's policy writes its part into: the rest is held.
 
         Args:
             last: (n, …), the last actions; None: nothing is held.
@@ -294,7 +294,7 @@ class Slice:
         return action
 
     def write(self, own: Array, last: Array | None) -> Array:
-        """Return whole actions (n, …) of its own ones (n, …).
+        """Write the skill's own actions (n, …) into whole actions (n, …), and return these.
 
         Args:
             last: (n, …), the last actions; needed only where it ``holds``.
@@ -395,7 +395,7 @@ class Viewed(Around):
 
 @dataclass(eq=False)
 class Override:
-    """An action that is taken where a condition holds."""
+    """An action that an acting policy takes where a condition holds."""
 
     name: str
     condition: Callable[..., Any] = code("observations (n, ...) to (n,) bool", "condition")

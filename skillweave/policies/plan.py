@@ -65,7 +65,7 @@ def check(
 
 @dataclass(eq=False)
 class Features:
-    """Standardised numbers of observations, by which the calls of a skill are compared."""
+    """Standardised numbers of observations, by which an acting plan compares a skill's calls."""
 
     places: Array
     """(F,) int64, which numbers of the flat observation, or of the function's answer."""
@@ -98,7 +98,7 @@ class Features:
 
 @dataclass(frozen=True)
 class Near:
-    """The nearest pieces of each option to n observations, each of another call.
+    """The nearest pieces of each option of a plan to n observations, each of another call.
 
     An option is a choice; of a skill with goals, a choice with one of the logged goals.
     """
@@ -117,7 +117,7 @@ class Near:
 
 @dataclass(eq=False)
 class OptionGroup:
-    """Options of a choice whose calls count for one another: one, or the goals of the nearest."""
+    """Options of a plan's choice whose calls count for one another: one, or the nearest goals."""
 
     choice: int
     options: int
@@ -196,7 +196,7 @@ class OptionGroup:
 
 @dataclass(eq=False)
 class Options:
-    """All options of a log, by groups."""
+    """All options that an acting plan chooses among, by groups of logged calls."""
 
     groups: tuple[OptionGroup, ...]
     aims: tuple[Array | None, ...]
@@ -287,7 +287,7 @@ class Options:
 def nearest(
     points: Array, to: Array, count: int, group: Array, squares: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return the ``count`` nearest points to each row of ``to``, each of another group.
+    """Return the ``count`` points of a plan nearest to each row of ``to``, of other groups.
 
     Args:
         points: (m, F) float32.
@@ -347,7 +347,7 @@ def weights_of(distance: Array) -> Array:
 
 @dataclass
 class Readings:
-    """Truths and rewards that a machine reads from n steps, whatever its states."""
+    """Truths and rewards that the machine of an acting plan reads from n steps."""
 
     events: Array
     """(n, E + 2) bool; the last but one is never true, the last always."""
@@ -361,7 +361,7 @@ class Readings:
 
 @dataclass(eq=False)
 class Machine:
-    """A task as states: after every step one transition at most, by events, which may pay.
+    """The task of an acting plan as states: after every step one transition at most, by events.
 
     Arrays have one row for each of the Q states, with T transitions, and H counters of steps in
     which an event has been true without a gap. A number of an event is that of a function; the
@@ -485,7 +485,7 @@ class Machine:
 
 @dataclass(eq=False)
 class Levels:
-    """The finite states that a task is planned in: a machine's, with levels of its counters.
+    """The finite states in which a plan values its task: a machine's, with levels of counters.
 
     Between two levels values are interpolated.
     """

@@ -32,7 +32,7 @@ SLACK = 0.03
 
 @dataclass(eq=False)
 class Planned(Rule):
-    """A selector that makes the choice whose nearest logged calls are worth most.
+    """A selector that acts by a plan: its choice is that whose nearest calls are worth most.
 
     Raises:
         PolicyError: the parts of the plan contradict one another.

@@ -35,7 +35,7 @@ from .untrusted import shown
 
 @dataclass(eq=False)
 class Rule(Selector):
-    """A rule that chooses skills, and goals for those that have some.
+    """The rule of a ready selector as it acts: it chooses skills, and goals for some.
 
     Raises:
         PolicyError: its data contradict each other.
@@ -102,6 +102,7 @@ class Rule(Selector):
     # Goals
 
     def _space(self, name: str, kind: type[SkillweaveError]) -> Space:
+        """Return the space of a skill's goals; raise where a rule gave one for a skill without."""
         if name not in self.goals:
             raise kind(
                 f"{self.who} gave a goal for skill {name!r}, which has no goals: set its "
@@ -176,7 +177,7 @@ def function_name(function: Any) -> str:
 
 @dataclass(eq=False)
 class FunctionRule(Rule):
-    """A function from observations (n, *obs_shape) to skills (n,): names, or places in the list.
+    """A selector that acts by a function of observations (n, *obs_shape) to skills (n,).
 
     Where skills have goals, it returns skills and goals: ``(names, goals)``, the goals
     (n, *goal_shape), or a dict of such goals by skill where several have some. They count where the
@@ -278,7 +279,7 @@ class FunctionRule(Rule):
 
 
 def _is_other_form(value: Any) -> bool:
-    """Return whether skills and goals are paired otherwise than as ``(names, goals)``."""
+    """Return whether a function that acts has paired skills and goals in another way."""
     if not isinstance(value, list | tuple):
         return False
     alone = isinstance(value, tuple) and len(value) == 2 and value[1] is None
@@ -286,7 +287,7 @@ def _is_other_form(value: Any) -> bool:
 
 
 def skill_and_goal(value: Any) -> tuple[Any, Any]:
-    """Return the name and the goal of ``(name, goal)``; of anything else itself, and None."""
+    """Return the name and the goal that a rule pairs; of anything else itself, and None."""
     if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], str):
         name, goal = value
         if goal is not None and not isinstance(goal, str):
@@ -302,7 +303,7 @@ ENDS = ("success", "failure")
 
 @dataclass(eq=False)
 class StateMachine(Rule):
-    """States with skills, and transitions by events in steps.
+    """An automaton as it acts: states with skills, and transitions by events in steps.
 
     After every step the first transition of a state whose event has happened is taken. Where a call
     is over, the state's first skill that may start is called; a policy that samples draws among
@@ -426,7 +427,7 @@ class Status(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Leaf:
-    """A skill in a tree."""
+    """A skill in an acting behaviour tree."""
 
     skill: str
     goal: Array | Callable[..., Any] | None = code(
@@ -437,7 +438,7 @@ class Leaf:
 
 @dataclass(frozen=True, eq=False)
 class TreeCondition:
-    """A condition in a tree: SUCCESS where it holds, else FAILURE."""
+    """A condition in an acting tree: SUCCESS where it holds, else FAILURE."""
 
     name: str
     """The function's name in messages."""
@@ -446,7 +447,7 @@ class TreeCondition:
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """A node with children, which are evaluated in order."""
+    """A node of an acting tree with children, which are evaluated in order."""
 
     kind: Literal["Sequence", "Fallback"]
     """A Sequence continues while they succeed, a Fallback while they fail."""
@@ -462,7 +463,7 @@ GOES_ON = {"Sequence": Status.SUCCESS, "Fallback": Status.FAILURE}
 
 @dataclass(eq=False)
 class Tree(Rule):
-    """A behaviour tree, evaluated for all environments at once, where calls are over.
+    """A behaviour tree as it acts, for all environments at once, where calls are over.
 
     It remembers ``leaf`` (that of the last call, −1: none), ``succeeded`` (that call succeeded),
     and ``child`` (n, C) (the running child of each branch).

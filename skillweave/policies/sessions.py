@@ -132,7 +132,7 @@ def _nodes_by_function(content: bytes, who: str) -> dict[Operator, list[Operator
 
 
 def _varint(content: bytes, at: int, most: int) -> tuple[int, int]:
-    """Return a number of ``most`` bytes at most, and the place after it.
+    """Return a number in an ONNX file of ``most`` bytes at most, and the place after it.
 
     Raises:
         IndexError: it does not end.
@@ -147,7 +147,7 @@ def _varint(content: bytes, at: int, most: int) -> tuple[int, int]:
 
 
 def _expanded(nodes: Mapping[Operator, Sequence[Operator]]) -> float:
-    """Return the number of nodes where functions are replaced by theirs.
+    """Return the number of an ONNX file's nodes where functions are replaced by theirs.
 
     Infinite: a function calls itself.
     """
@@ -209,7 +209,7 @@ def open_session(content: bytes, who: str, *, trial: bool = False) -> Any:
 
 
 class Trial:
-    """A session whose runs are bounded in time and memory."""
+    """A session of onnxruntime whose runs are bounded in time and memory."""
 
     def __init__(self, session: Any) -> None:
         self._session = session
@@ -253,7 +253,7 @@ class Trial:
 
 @cache
 def _bound_memory() -> None:
-    """Let trials allocate memory together, up to ``MOST_MEMORY``; other sessions do not."""
+    """Let trials of ONNX files allocate memory together, up to ``MOST_MEMORY``."""
     import onnxruntime
 
     kind = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR

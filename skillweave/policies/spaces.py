@@ -32,7 +32,7 @@ output of a network."""
 
 @dataclass(eq=False)
 class Space:
-    """Arrays (…, *shape) between bounds; or records of named parts.
+    """A space as plain data, without Gymnasium: arrays (…, *shape) in bounds, or named parts.
 
     Raises:
         PolicyError: it is none.
@@ -438,7 +438,7 @@ def at(x: Array, path: tuple[str, ...]) -> Array:
 
 
 def _numbers(value: Any) -> Array:
-    """Return a mask as an array; of lists of unequal lengths their numbers, one after another."""
+    """Return a mask of actions as an array; of unequal lists their numbers, one after another."""
     try:
         mask = np.asarray(value)
     except ValueError:

@@ -18,7 +18,7 @@ _SHOWN = 60
 
 
 def shown(value: object, most: int = _SHOWN) -> str:
-    """Return a value for a message: its ``repr``, shortened."""
+    """Return a value for a message about a file from others: its ``repr``, shortened."""
     try:
         text = repr(value)
     except Exception:  # a number of too many digits, or nested too deep
@@ -40,7 +40,7 @@ def checksum(content: bytes) -> str:
 
 
 def check_file(path: Path, most: int | None = None) -> None:
-    """Raise a RunError where ``path`` is not a plain file, or has more than ``most`` bytes.
+    """Raise a RunError where a file from others is not plain, or has more than ``most`` bytes.
 
     A pipe would wait forever, and a device may never end.
     """
@@ -61,7 +61,7 @@ def check_file(path: Path, most: int | None = None) -> None:
 
 
 def read_file(path: Path, most: int | None = None) -> bytes:
-    """Return the content of a plain file.
+    """Return the content of a plain file that others may have made, with a bound.
 
     Raises:
         RunError: it is missing, no plain file, too large, or cannot be read.
@@ -77,7 +77,7 @@ def read_file(path: Path, most: int | None = None) -> bytes:
 
 
 def parse_json(text: str | bytes, where: Path | str) -> Any:
-    """Parse a JSON text whose numbers are finite and that is nested at most ``DEEPEST`` deep.
+    """Parse a JSON text from others: finite numbers, nested at most ``DEEPEST`` deep.
 
     Raises:
         RunError: it is damaged; the message begins with ``where``.
@@ -99,7 +99,7 @@ def parse_json(text: str | bytes, where: Path | str) -> Any:
 
 
 def load_json(text: str | bytes, **how: Any) -> Any:
-    """Load JSON as ``json.loads`` does, without lone surrogates, which cannot be shown or saved.
+    """Load JSON from others as ``json.loads`` does, without lone surrogates.
 
     Raises:
         ValueError: it is not JSON, or holds a lone surrogate.

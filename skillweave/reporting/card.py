@@ -82,6 +82,7 @@ def _shown(path: str) -> str:
 
 
 def _use(run: RunDirectory, name: str) -> str:
+    """Return the section of a model card on the use of the run."""
     code = run.manifest.needs_recipe
     given = ", hierarchy" if code else ""
     lines = ["## Use", ""]
@@ -144,6 +145,7 @@ def _handed_over(run: RunDirectory) -> list[str]:
 
 
 def _training(run: RunDirectory) -> str:
+    """Return the section of a model card on the stages of training."""
     keys = ("name", "algorithm", "steps", "seconds", "return", "notes")
     head = ("stage", "algorithm", "steps", "seconds", "return at its end", "")
     stages = stage_rows(run, reached_steps(read_curves(run)))

@@ -51,7 +51,7 @@ AXES = {
 
 @dataclass(frozen=True)
 class Line:
-    """A line of several seeds; arrays (G,)."""
+    """A line of a figure, of several seeds; arrays (G,)."""
 
     label: str
     seeds: int
@@ -138,7 +138,7 @@ def plot_curves(
 def _groups(
     runs: Paths | Mapping[str, Paths], labels: Sequence[str] | None
 ) -> dict[str, list[RunDirectory]]:
-    """Return the runs of each line, by its name."""
+    """Return the runs of each line of the figure, by its name."""
     if isinstance(runs, Mapping):
         groups = {str(label): open_runs(_paths(paths)) for label, paths in runs.items()}
     else:
@@ -165,7 +165,7 @@ def _metric(
     metric: str | None,
     agent: str | None,
 ) -> str:
-    """Return the metric that is drawn; every run has it."""
+    """Return the metric that the figure draws; every run has it."""
     if metric is None:
         every = all("eval_return" in curves[run.path] for run in runs)
         metric = "eval_return" if every else "return"
@@ -220,6 +220,7 @@ def _line(label: str, curves: Sequence[Curve], band: Band) -> Line:
 
 
 def _caption(lines: Sequence[Line], band: Band) -> str:
+    """Return the figure's sentence on its lines and bands."""
     counts = sorted({line.seeds for line in lines})
     if counts == [1]:
         return "Lines: one seed each."
@@ -273,6 +274,7 @@ def _draw(
 
 
 def _save(figure: Any, out: Path) -> tuple[Path, ...]:
+    """Save the figure of learning curves as PNG and SVG."""
     stem = out.with_suffix("") if out.suffix in (".png", ".svg") else out
     paths = tuple(stem.parent / f"{stem.name}{suffix}" for suffix in (".png", ".svg"))
     with written(stem):

@@ -15,7 +15,7 @@ from skillweave._internal.terminal import end_quietly, printable
 
 @dataclass
 class Row:
-    """A line of progress."""
+    """A line of displayed progress."""
 
     name: str
     """The activity."""
@@ -39,7 +39,7 @@ class Row:
 
 
 class Display:
-    """A display of rows, each under the ones before.
+    """A display of rows of progress, each under the ones before.
 
     It turns silent once it cannot be drawn, so that training continues: its reader has ended, or
     the disk of a log is full.
@@ -71,6 +71,7 @@ class Display:
         self._try(self._close)
 
     def _try(self, act: Callable[..., None], *arguments: str) -> None:
+        """Draw, unless drawing failed before; a terminal that is gone ends the display."""
         if self._draws:
             try:
                 act(*arguments)
@@ -125,6 +126,7 @@ class Bars(Display):
         bars.start()
 
     def _draw(self) -> None:
+        """Draw the bars of progress on the terminal."""
         for key, row in self._rows.items():
             texts = {k: getattr(row, k) for k in ("steps", "result", "speed", "left")}
             if key not in self._tasks:
@@ -155,6 +157,7 @@ class Cell(Display):
         self._messages: list[str] = []
 
     def _draw(self) -> None:
+        """Draw the table of progress in a notebook's cell."""
         indent = "\N{NO-BREAK SPACE}" * 4
         cells, lines = [], []
         for row in self._rows.values():

@@ -92,6 +92,7 @@ def _draw_lineage(make: Any, lineage: Lineage, name: str, color: str) -> Any:
 
 
 def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[LineageLine], color: str) -> None:
+    """Draw the fitness of a population's members by generation, with the winner's line."""
     for born in lineage.born.values():
         parent = lineage.parent(born)
         if born.fitness is None:
@@ -132,6 +133,7 @@ def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[LineageLine], colo
 def _draw_setting(
     axes: Any, setting: str, lineage: Lineage, path: Sequence[LineageLine], color: str
 ) -> None:
+    """Draw a setting of a population's members by generation, with the winner's line."""
     values = {id(b): number_of(b, setting) for b in lineage.born.values()}
     scale = lineage.scale(setting)
     if scale == "words":
@@ -150,6 +152,7 @@ def _draw_setting(
 
 
 def _plain(axes: Any, label: str, below: str = "generation") -> None:
+    """Give a figure's axes labels and plain borders."""
     axes.set_ylabel(label, fontsize=8)
     axes.set_xlabel(below, fontsize=8)
     axes.tick_params(which="both", labelsize=8)

@@ -65,6 +65,7 @@ class VideoWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Close the video file and give it its name; remove it if an error ended the block."""
         try:
             if kind is not None:
                 with suppress(OSError):  # the error that ended the block is raised
@@ -92,6 +93,7 @@ class _Mp4:
         self._process: Any = None
 
     def add(self, frame: Array, seconds: float | None) -> None:
+        """Write a frame into an MP4, by ffmpeg."""
         # The colours have half the resolution, so both sides must be even.
         frame = np.pad(frame, [(0, n % 2) for n in frame.shape[:2]] + [(0, 0)], mode="edge")
         if self._process is None:
@@ -110,6 +112,7 @@ class _Mp4:
             self.close(complete=True)
 
     def close(self, complete: bool) -> None:
+        """Close the MP4; raise a RunError where ffmpeg could not write it."""
         process = self._process
         self._process = None
         complaint = process.communicate()[1] if process else b""
@@ -133,6 +136,7 @@ class _Gif:
         self._shown: Array = np.empty(0)  # (H, W) uint8
 
     def add(self, frame: Array, seconds: float | None) -> None:
+        """Write a frame into a GIF: only the part that has changed."""
         image = self._image.fromarray(frame)
         if self._table is None:
             self._start(image)

@@ -33,7 +33,7 @@ class RunLike(Protocol):
 
 @contextmanager
 def called_by(caller: Caller) -> Iterator[None]:
-    """Set the caller that messages are printed for; the outermost caller counts."""
+    """Set for whom messages print commands: the command line or Python."""
     before = _CALLER.set(_CALLER.get() or caller)
     try:
         yield
@@ -42,7 +42,7 @@ def called_by(caller: Caller) -> Iterator[None]:
 
 
 def from_command_line() -> bool:
-    """Return whether the user typed a command."""
+    """Return whether messages print commands: the user typed one."""
     return _CALLER.get() == "command line"
 
 
@@ -103,12 +103,12 @@ def _call(run: RunLike, arguments: str) -> str:
 
 
 def python_string(text: object) -> str:
-    """Return a Python string literal, in double quotes."""
+    """Return a Python string literal for a line that messages print, in double quotes."""
     return json.dumps(str(text), ensure_ascii=False)
 
 
 def saved_words(run: RunLike) -> str:
-    """Return the progress that a stopped run has saved, in words."""
+    """Return for a message, beside the command that resumes it, what a stopped run saved."""
     if header := Checkpoints(run.path).latest_header():
         return f"saved at {header.steps:,} steps of {header.stage}"
     stages = run.manifest.stages

@@ -30,7 +30,7 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class Comparison:
-    """The hierarchy that a stage ended with, and the mean returns of the compared ones."""
+    """The record of a run of the hierarchies compared at a stage's end, and the kept one."""
 
     kept: Candidate
     before: float | None = None

@@ -73,7 +73,7 @@ def write_bytes(
 
 @contextmanager
 def written(path: Path) -> Iterator[None]:
-    """Turn an OSError of the block, which writes a file, into a RunError that names ``path``."""
+    """Turn an OSError while the block writes a file into a RunError that names ``path``."""
     try:
         yield
     except OSError as error:
@@ -81,7 +81,7 @@ def written(path: Path) -> Iterator[None]:
 
 
 def move(source: Path, target: Path) -> None:
-    """Rename a file, in place of a file with that name.
+    """Rename a file of a run, in place of a file with that name.
 
     Raises:
         RunError: the disk is full or cannot be written; both files are unchanged.
@@ -105,7 +105,7 @@ def check_utf8(path: Path) -> None:
 
 
 def make_directory(path: Path) -> None:
-    """Make a directory in an existing one.
+    """Make a directory of a run in an existing one.
 
     Raises:
         RunError: it cannot be made.
@@ -117,7 +117,7 @@ def make_directory(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Delete a file, if it exists.
+    """Delete a file of a run, if it exists.
 
     Raises:
         RunError: it cannot be deleted.
@@ -129,6 +129,7 @@ def remove(path: Path) -> None:
 
 
 def _unwritten(path: Path, error: OSError) -> RunError:
+    """Return the RunError for a file of a run that could not be written."""
     if isinstance(error, FileNotFoundError):
         return RunError(
             f"could not write {path}: its directory no longer exists; was it deleted or moved?"
@@ -137,7 +138,7 @@ def _unwritten(path: Path, error: OSError) -> RunError:
 
 
 def _sync(directory: Path) -> None:
-    """Write a new name to the disk, before older files are deleted."""
+    """Write the new name of a run's file to the disk, before older files are deleted."""
     with suppress(OSError):  # not every system supports this
         handle = os.open(directory, os.O_RDONLY)
         try:
@@ -274,7 +275,7 @@ def check_unchanged(path: Path, header: Mapping[str, Any], recorded: str | None)
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """Return the header alone, quickly: its checksum is not compared.
+    """Return the header of a safetensors file alone, quickly: no checksum is compared.
 
     Raises:
         RunError: as ``read_tensors``.
@@ -283,6 +284,7 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def _open(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the header and the tensors of a safetensors file of a run."""
     check_utf8(path)
     check_file(path)
     try:
@@ -322,7 +324,7 @@ def _json(path: Path, data: Mapping[str, Any], **options: Any) -> str:
 def _digest(
     path: Path, content: Mapping[str, Any], tensors: Mapping[str, Tensor] = MappingProxyType({})
 ) -> str:
-    """Return the checksum of a file with this content and these tensors."""
+    """Return the checksum of a run's file with this content and these tensors."""
     plain = {k: v for k, v in content.items() if k != "sha256"}
     digest = hashlib.sha256(_json(path, plain, sort_keys=True).encode())
     for name in sorted(tensors):
@@ -384,7 +386,7 @@ def own_copy(path: Path) -> None:
 
 
 def _entries(folder: Path) -> Iterator[Path]:
-    """Yield all entries below a folder; links are not followed."""
+    """Yield all entries below a run's folder; links are not followed."""
 
     def fail(error: OSError) -> None:
         raise RunError(f"could not read {error.filename}: {error.strerror}") from error

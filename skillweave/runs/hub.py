@@ -335,6 +335,7 @@ def status_of(error: BaseException | None) -> Any:
 def _sentence(
     error: Exception, endpoint: str, name: str, writes: bool, revision: str | None
 ) -> str:
+    """Return a sentence on an error of the Hugging Face Hub, and its remedy."""
     errors = importlib.import_module("huggingface_hub.errors")
     status = status_of(error)
     login = "log in (hf auth login), or set HF_TOKEN"

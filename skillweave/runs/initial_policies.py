@@ -83,7 +83,7 @@ def learners_of_run(path: Path) -> dict[str, Learnt]:
 
 
 def options_of(manifest: Manifest, name: str) -> Chooses:
-    """Return the options that a selector or a critic of skills chooses among; else empty."""
+    """Return by a run's manifest the options that a selector or a critic chooses among."""
     if not decides(name):
         return (), ()
     level = level_of(name)

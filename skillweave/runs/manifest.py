@@ -136,7 +136,7 @@ class Winner:
 
 @dataclass(frozen=True)
 class Target:
-    """A value of the periodic evaluation at which a stage ends before its budget is spent."""
+    """An entry of ``run.json``: the evaluation's value at which a stage ends early."""
 
     of: Literal["return", "success"]
     """The criterion: the mean return, or the share of episodes that succeed."""
@@ -180,7 +180,7 @@ class Stopped:
 
 @dataclass(frozen=True)
 class Best:
-    """The evaluation whose weights a stage ended with."""
+    """An entry of ``run.json``: the evaluation whose weights a stage ended with."""
 
     steps: Count
     of: Literal["return", "success"]
@@ -219,7 +219,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Matrix:
-    """Counts of calls, and of those that were done, by the skill before (``Handover``)."""
+    """Counts of calls and done ones in ``run.json``, by the skill before (``Handover``)."""
 
     skills: list[str]
     calls: list[list[Count]]
@@ -440,7 +440,7 @@ MetricsLine = TypedDict(
 
 @dataclass(frozen=True)
 class Origin:
-    """The origin of a member: its parent, and the old and new values of changed settings."""
+    """The origin of a member, in a run's files: its parent, and changed settings."""
 
     parent: Count | None = None
     mutation: str = "start"
@@ -627,7 +627,7 @@ def identity(manifest: Manifest) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Skillweave, Python and dependencies, and the platform."""
+    """Return the versions of Skillweave, Python and dependencies for ``run.json``."""
     version_of = {"python": platform.python_version(), "platform": platform.platform()}
     for name in ("skillweave", "torch", "gymnasium", "numpy", "envpool"):
         try:

@@ -366,6 +366,7 @@ class Guarded(Tracker):
         self._failed = False
 
     def _attempt(self, function: Callable[..., None], *values: Any) -> None:
+        """Call the tracker; the first error becomes a notice, and training continues."""
         try:
             function(*values)
         except Exception as error:  # of any tracker: no network, a full disk, a closed run

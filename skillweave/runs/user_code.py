@@ -40,7 +40,7 @@ MUTATORS = {"append", "add", "clear", "extend", "fill", "insert", "pop", "remove
 
 
 def environment_texts(spec: EnvSpec) -> Texts:
-    """Return the texts of an environment: its name, arguments, wrappers and code."""
+    """Return the texts of an environment that a run records: name, arguments, code."""
     # The library's object that scores a planned task changes no step.
     wrappers = [w for w in spec.wrappers if not type(w).__module__.startswith("skillweave.")]
     kinds = [getattr(wrapper, "func", wrapper) for wrapper in wrappers]
@@ -57,7 +57,7 @@ def environment_texts(spec: EnvSpec) -> Texts:
 def skill_texts(
     skills: Mapping[str, Skill], reflexes: Iterable[Reflex], without: str = ""
 ) -> Texts:
-    """Return the texts of skills' methods and policies, and of reflexes.
+    """Return the texts of skills that a run records: methods, policies, reflexes.
 
     Args:
         skills: by name.
@@ -81,7 +81,7 @@ def notice_changes(then: Texts, now: Texts, since: str) -> None:
 
 
 def changes(then: Texts, now: Texts) -> str:
-    """Return the recorded differences of the user's code, as clauses; empty: there are none."""
+    """Return how a run's recorded user code differs from now, as clauses; empty: it does not."""
     clauses = []
     for what, text in now.items():
         before = then.get(what)
@@ -105,7 +105,7 @@ def _text(thing: Any) -> str:
 
 
 def _maker(env: Any) -> Any:
-    """Return the function that makes an environment; of an id, the registered one of the user."""
+    """Return the function that makes an environment, whose code a run records."""
     entry = gym.registry.get(str(env).rpartition(":")[2])
     if entry is None:
         return env
@@ -119,7 +119,7 @@ def _maker(env: Any) -> Any:
 
 
 def _form(x: Any, seen: dict[int, Any], owner: Any = None) -> Any:
-    """Return a value as JSON; of what is neither plain nor code, the name of its class.
+    """Return a value that a run records of the user's code, as JSON; of others the class's name.
 
     Args:
         seen: the values that were read already; each is read once.
@@ -170,7 +170,7 @@ def _form(x: Any, seen: dict[int, Any], owner: Any = None) -> Any:
 
 @functools.lru_cache(maxsize=1024)
 def _source(code: Any) -> tuple[str, list[str]]:
-    """Return the source of a function or a class in one layout, and the names that it uses.
+    """Return the source of a user's function or class as a run records it, and its names.
 
     These are names that it does not assign, and attributes of them: ``self.gain``.
 

@@ -168,7 +168,7 @@ class _Reader:
 
 
 def _scaling(parts: Sequence[tuple[Any, int, str]], shape: tuple[int, ...]) -> tuple[Affine, ...]:
-    """Return the scaling of an input of parts: settings, width, and name in messages of each."""
+    """Return the scaling of a mapping's input: settings, width and name of each part."""
     columns: list[Array | None] = []
     neutral = ("offset", 0.0), ("scale", 1.0), ("clip", -np.inf), ("clip", np.inf)
     for name, default in neutral:
@@ -191,7 +191,7 @@ def _wide(value: float | tuple[float, ...], n: int, where: str) -> Array:
 
 
 def for_model(inputs: dict[str, Input], expected: Shapes, who: str) -> dict[str, Input]:
-    """Return inputs in the shapes that a model takes.
+    """Return a mapping's inputs in the shapes that a model from elsewhere takes.
 
     Raises:
         PolicyError: one is not set, does not exist, or has another shape.
@@ -238,7 +238,7 @@ def for_model(inputs: dict[str, Input], expected: Shapes, who: str) -> dict[str,
 def places_in(
     places: slice | tuple[int, ...] | None, size: int, where: str, action: Space[Any] | None = None
 ) -> Array:
-    """Return places as an array; check that they are below ``size``.
+    """Return a declared mapping's places as an array; check that they are below ``size``.
 
     Args:
         where: begins the message.
@@ -265,7 +265,7 @@ def places_in(
 
 
 def fitted_outputs(acts: Acts | None, space: Space[Any], who: str, logits: bool) -> Outputs:
-    """Return the meaning of a policy's outputs, for an action space.
+    """Return the meaning of outputs by a declared ``acts``, for an action space.
 
     Raises:
         PolicyError: ``acts`` does not fit the space; the message begins with ``who``.

@@ -123,7 +123,7 @@ def fitted(
 
 
 def _other_parts(mine: Space[Any], theirs: Space[Any]) -> str:
-    """Return a clause that names parts which only one of two spaces has; nothing if none."""
+    """Return a clause on parts that only the space of a foreign policy, or the other, has."""
     ours, others = (getattr(space, "spaces", None) for space in (mine, theirs))
     if not isinstance(ours, Mapping) or not isinstance(others, Mapping):
         return ""
@@ -213,7 +213,7 @@ def as_recorded(
     read: Callable[[], bytes | None],
     where: str,
 ) -> Policy:
-    """Return the policy at the time when ``recorded`` was its source; ``read`` reads the copy.
+    """Return a skill's ready policy as of when ``recorded`` was its source; ``read`` reads a copy.
 
     Raises:
         RunError: the policy has another kind, or another checksum without a copy; or the copy or
@@ -248,7 +248,7 @@ def qualified(thing: Any) -> str:
 
 
 def made_up(space: Space[Any], n: int) -> Array:
-    """Draw n elements of a space as one batch; none are huge, as a space's bounds may be."""
+    """Draw n elements of a space, none of them huge, to try out a policy from elsewhere."""
     drawn = draw_from(space, n, np.random.default_rng(0))
     for path, leaf in space_of(space).leaves.items():
         part = at(drawn, path)

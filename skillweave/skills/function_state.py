@@ -151,7 +151,7 @@ GENERATORS: dict[type, tuple[Callable[[Any], Any], Callable[[Any, Any], Any]]] =
 
 
 def _global_generators() -> Iterator[Any]:
-    """Yield the generators of Python, NumPy and torch; torch is not imported for that."""
+    """Yield the global generators that a user's function may draw from; torch if imported."""
     yield random.random.__self__  # type: ignore[attr-defined]
     yield np.random.get_state.__self__  # type: ignore[attr-defined]
     if (torch := sys.modules.get("torch")) is not None:
@@ -166,6 +166,7 @@ def _random_state(generator: Any) -> Any:
 
 
 def _set_random_state(generator: Any, state: Any) -> None:
+    """Set the state of a random generator that a user's function may have drawn from."""
     for kind, (_, write) in GENERATORS.items():
         if isinstance(generator, kind):
             write(generator, state)
@@ -214,7 +215,7 @@ def _reachable(thing: Any, known: dict[int, Any], depth: int = DEPTH) -> Iterato
 
 
 def _same(state: Any, other: Any) -> bool:
-    """Return whether two states of a random generator are the same."""
+    """Return whether two states of a user's random generator are the same."""
     if isinstance(state, dict):
         return all(map(_same, state.values(), other.values()))
     if isinstance(state, tuple):
@@ -223,7 +224,7 @@ def _same(state: Any, other: Any) -> bool:
 
 
 def _copied(value: Any) -> Any:
-    """Return a copy of a value that may change in place; of others the value itself."""
+    """Return a copy of a user's attribute that may change in place; of others the value itself."""
     try:
         return copy.deepcopy(value) if isinstance(value, CHANGING) else value
     except Exception:  # it cannot be copied
@@ -231,7 +232,7 @@ def _copied(value: Any) -> Any:
 
 
 def _equal(one: Any, other: Any) -> bool:
-    """Return whether two values are equal but for rounding."""
+    """Return whether two values of a user's attribute are equal but for rounding."""
     try:
         return bool(np.isclose(one, other, rtol=1e-4, atol=1e-6, equal_nan=True).all())
     except Exception:  # of texts, parts with names, and objects

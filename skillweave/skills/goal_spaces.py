@@ -96,7 +96,7 @@ def shown_goal(goal: Array) -> str:
 
 
 def draw_from(space: gym.Space[Any], n: int, rng: np.random.Generator) -> Array:
-    """Draw n elements of a space as one batch: uniformly where it is bounded."""
+    """Draw n goals, or elements of another space, as one batch: uniformly where it is bounded."""
     whole = space_of(space)
     batch = whole.start(n)
     for path, leaf in whole.leaves.items():
@@ -120,7 +120,7 @@ def draw_from(space: gym.Space[Any], n: int, rng: np.random.Generator) -> Array:
 
 
 def alone(space: Data, goal: Any) -> Any:
-    """Return one element of a space as a batch of one, parts in a dict; it is not checked.
+    """Return one goal, or element of a space, as a batch of one; it is not checked.
 
     A value that is no element is returned as it is, or as a batch, so that the check of the batch
     can show it.

@@ -23,7 +23,7 @@ from skillweave.schema import Check, fitted, settings
 
 
 def floats(value: Any) -> float | tuple[float, ...]:
-    """Return finite numbers as a float, or a tuple of such; raise a ValueError: they are none."""
+    """Return finite numbers of a declared mapping as floats; raise a ValueError: they are none."""
     array = np.asarray(value, np.float64)
     if isinstance(value, str | bool) or array.ndim > 1 or not array.size:
         raise ValueError
@@ -40,6 +40,7 @@ def _range(value: Any) -> tuple[float, float]:
 
 
 def _places(value: Any) -> slice | tuple[int, ...]:
+    """Return places in a mapping, as a user or a file writes them: a slice or a tuple."""
     if isinstance(value, str):  # as files have slices
         value = slice(*(int(x) if x else None for x in value.split(":")))
     if isinstance(value, slice):
@@ -341,7 +342,7 @@ def mapping_of(
 
 
 def function_name(function: Any) -> str:
-    """Return the name of a user's function in files."""
+    """Return the name of a function that a user declares, in files."""
     try:
         return str(named(function, "a function"))
     except DeclarationError:  # a method of an object, for example
@@ -387,7 +388,7 @@ _NOT_OF_SKILLS: dict[type[Any], str] = {
 
 
 def is_places(value: Any) -> bool:
-    """Return whether a value is one place, or several: a slice, a range, a list or an array."""
+    """Return whether a value in ``sees`` or ``acts`` is one place, or several."""
     if isinstance(value, slice | range | np.ndarray):
         return True
     return _is_whole(value) or (
@@ -431,6 +432,7 @@ def checked_sees(sees: Any, of_skill: bool = False) -> dict[str, tuple[Source, .
 
 
 def _checked_parts(parts: Any, where: str, of_skill: bool) -> tuple[Source, ...]:
+    """Return an entry of ``sees`` as sources: parts, goals, last actions, functions."""
     size = parts.size if isinstance(parts, np.ndarray) else None
     if size == 0 or (isinstance(parts, list | tuple | range) and not parts):
         raise DeclarationError(f"{where} is empty; name at least one part of the observation")
@@ -440,6 +442,7 @@ def _checked_parts(parts: Any, where: str, of_skill: bool) -> tuple[Source, ...]
 
 
 def _checked_acts(acts: Any) -> Acts | None:
+    """Return ``acts`` of a mapping as ``Acts``; None: not given."""
     if acts is None or isinstance(acts, Acts):
         return acts
     if is_places(acts) or isinstance(acts, list | tuple):
@@ -450,7 +453,7 @@ def _checked_acts(acts: Any) -> Acts | None:
 
 
 def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
-    """Return the entries of the recurrent state, and True if it is one array."""
+    """Return the declared recurrent state of a policy, and True if it is one array."""
     if state is None:
         return (), False
     if isinstance(state, Mapping) and state:
@@ -474,7 +477,7 @@ def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
 
 
 def to_json(value: Any, names: Mapping[int, str] | None = None) -> Any:
-    """Return settings as JSON; those that have their defaults are left out.
+    """Return a declared mapping's settings as JSON; those with their defaults are left out.
 
     Args:
         value: a slice becomes a text, ``0:45``.

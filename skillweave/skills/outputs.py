@@ -148,7 +148,7 @@ def checked(
     elapsed: Array | int | None = None,
     ids: Array | None = None,
 ) -> Array:
-    """Convert ``value`` to an array (n,) of ``dtype``: bool, or the type of rewards.
+    """Convert a user's answer to an array (n,) of ``dtype``: bool, or the type of rewards.
 
     Args:
         elapsed: steps of the rows, (n,) or (), for messages.
@@ -196,7 +196,7 @@ def checked(
 
 
 def parameters_of(function: Any) -> list[inspect.Parameter]:
-    """Return the parameters of a function; none if Python has no signature of it."""
+    """Return the parameters of a user's function; none if Python has no signature of it."""
     try:
         return list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):  # of some functions written in C
@@ -204,7 +204,7 @@ def parameters_of(function: Any) -> list[inspect.Parameter]:
 
 
 def required_arguments(function: Any) -> int:
-    """Return the number of required arguments of a function, as far as they are known."""
+    """Return the number of required arguments of a user's function, as far as known."""
     return sum(
         p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty
         for p in parameters_of(function)
@@ -212,7 +212,7 @@ def required_arguments(function: Any) -> int:
 
 
 def _advice(error: BaseException, function: Any, argument: Any, ids: Array | None) -> str:
-    """Return advice for common mistakes; else an empty string."""
+    """Return advice on a mistake of a user's function, if it is a common one; else ""."""
     text = str(error)
     step = isinstance(argument, Step)
     obs = argument.next_obs if step else argument
@@ -265,7 +265,7 @@ def _advice(error: BaseException, function: Any, argument: Any, ids: Array | Non
 
 
 def blame(error: BaseException, who: str) -> NoReturn:
-    """Raise a PolicyError that names ``who`` where the user's code raised ``error``.
+    """Raise a PolicyError that names ``who`` where the user's function raised ``error``.
 
     Otherwise raise ``error`` itself: its traceback shows a bug of this library.
     """
@@ -280,7 +280,7 @@ def at_step(elapsed: Any) -> str:
 
 
 def as_array(value: Any, who: str, kind: type[SkillweaveError] = SkillError) -> Array:
-    """Return ``value`` as an array.
+    """Return ``value``, the answer of a user's function, as an array.
 
     Raises:
         SkillError: it cannot be converted; the message names ``who``. ``kind`` is the type of the
@@ -304,7 +304,7 @@ def info_keys(info: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def missing_key(info: Mapping[str, Any]) -> str:
-    """Return a clause on a key that no environment sets."""
+    """Return a clause on a key of info that a user's function reads, and none sets."""
     far = isinstance(info, Infos)
     keys = keys_of(info.keys_so_far.examples if isinstance(info, Infos) else info)
     return (

@@ -169,7 +169,7 @@ def rest_of(rest: Any, space: Space[Any]) -> tuple[Array, Held]:
 def _filled(
     zero: Array, rest: Any, space: Data, where: str, path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Array]]:
-    """Write the numbers of a rest over the zeros (…) of an action, or of its part at a ``path``.
+    """Write a declared rest's numbers over the zeros (…) of an action, or of a part of it.
 
     Yields:
         The path of each leaf, and (…) bool, which of its numbers are held, where some are.
@@ -222,7 +222,7 @@ Paths = tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]
 
 
 def _written(acts: Any, space: Space[Any], who: str) -> tuple[Data, tuple[int, ...] | None, Paths]:
-    """Return the space of a skill's own actions, and its places or paths, as of ``Slice``."""
+    """Return the space that a skill's declared ``acts`` writes, and its places or paths."""
     named = isinstance(acts, tuple) and isinstance(acts[0], str)
     data = space_of(space)
     if data.parts is not None and not named:
@@ -252,6 +252,7 @@ def _written(acts: Any, space: Space[Any], who: str) -> tuple[Data, tuple[int, .
 
 
 def _named(names: tuple[str, ...], space: Data, who: str) -> tuple[Data, Paths]:
+    """Return the parts of a Dict action that a skill's ``acts`` names, and their paths."""
     found: dict[tuple[str, ...], Data] = {}
     for name in names:
         path = tuple(name.split("."))
@@ -278,7 +279,7 @@ def _named(names: tuple[str, ...], space: Data, who: str) -> tuple[Data, Paths]:
 
 
 class OwnPart:
-    """The part of observations that a skill sees, and of actions that it writes.
+    """A declared skill's part of observations and actions, checked and fitted to spaces.
 
     Args:
         skill: sees all without ``sees``, and writes all without ``acts``.

@@ -68,7 +68,7 @@ _notes: dict[int, tuple[weakref.ref[Any], dict[Any, Any]]] = {}
 
 
 def _notes_of(owner: Any) -> dict[Any, Any] | None:
-    """Return this process's notes about an object; None: it can have none."""
+    """Return the notes about looks at a user's object; None: it can have none."""
     key = id(owner)
     if key not in _notes:
         try:
@@ -166,6 +166,7 @@ class Look:
             self._ask_others()
 
     def _ask_others(self) -> None:
+        """Call the user's function again with other rows; compare its answers by row."""
         call = self._call
         every = np.arange(self._n)
         axes = {self._n, *(size for x in call.arrays for size in sizes_in(x))}
@@ -300,6 +301,7 @@ class Look:
         )
 
     def _refuse_state(self, differs: tuple[Any, Any, int]) -> None:
+        """Raise a SkillError where a user's function answers otherwise when called again."""
         if self._judges:
             before, after, _ = differs
             raise SkillError(
@@ -309,6 +311,7 @@ class Look:
             )
 
     def _refuse_statistics(self, differs: tuple[Any, Any, int] | None) -> None:
+        """Raise an error where a user's function lets one environment depend on others."""
         if differs is not None:
             one, two, row = differs
             raise self._kind(
@@ -319,6 +322,7 @@ class Look:
             )
 
     def _notice_wrap(self, differs: tuple[Any, Any, int], narrow: str) -> None:
+        """Give a notice where a user's function computes in small integers that overflow."""
         if self._reads_bytes():
             return
         one, two, _ = differs

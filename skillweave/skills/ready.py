@@ -34,6 +34,7 @@ def ready_policy(skill: Skill) -> Policy | None:
 
 
 def _as_policy(value: Any, skill: Skill) -> Policy:
+    """Return the value of a skill's attribute ``policy`` as a policy; a method may be one."""
     # A function in a class body becomes a method when it is looked up. It is a method if it needs
     # two arguments (``def policy(self, obs)``), and a function of obs if it needs one.
     bound = isinstance(value, MethodType) and value.__self__ is skill

@@ -61,7 +61,7 @@ class Call:
 
 
 def changed(given: Any, change: Callable[[Any], Any]) -> Any:
-    """Return arguments with ``change`` of all values in them, also of those in infos."""
+    """Return arguments of a user's function with ``change`` of all values in them."""
     if is_dataclass(given):
         parts = {f.name: changed(getattr(given, f.name), change) for f in fields(given)}
         kind: Any = type(given)
@@ -98,7 +98,7 @@ class _Info(Mapping[Any, Any]):
 
 
 def _values(given: Any) -> Iterator[Any]:
-    """Yield all values in arguments, without those in infos."""
+    """Yield all values in arguments of a user's function, without those in infos."""
     if is_dataclass(given):
         for part in fields(given):
             if part.name != "info":
@@ -118,6 +118,7 @@ def as_type(x: Any, kind: str) -> Any:
 
 
 def _other_type(dtype: np.dtype[Any], kind: str) -> np.dtype[Any]:
+    """Return another type of whole numbers for rows with which a function is called again."""
     if dtype.names:
         parts = [(name, _other_type(dtype[name], kind)) for name in dtype.names]
         return np.dtype(parts, align=dtype.isalignedstruct)
@@ -131,7 +132,7 @@ def _other_type(dtype: np.dtype[Any], kind: str) -> np.dtype[Any]:
 
 
 def sizes_in(x: Array) -> Iterator[int]:
-    """Yield the sizes of an array's axes after the first, and of those of its fields."""
+    """Yield sizes of later axes in a user's arguments, which other rows must not have."""
     yield from x.shape[1:]
     parts = [x.dtype]
     for dtype in parts:
@@ -141,7 +142,7 @@ def sizes_in(x: Array) -> Iterator[int]:
 
 
 def narrow_types(dtype: np.dtype[Any]) -> Iterator[str]:
-    """Yield the types of whole numbers in an array that are not int64."""
+    """Yield the types of whole numbers in a user's arguments that are not int64."""
     for part, *_ in (dtype.fields or {}).values():
         yield from narrow_types(part.base)
     if dtype.kind in "iu" and dtype != np.int64:
@@ -152,7 +153,7 @@ def narrow_types(dtype: np.dtype[Any]) -> Iterator[str]:
 
 
 def parts_of(answer: Any) -> dict[str, Array]:
-    """Return the arrays in an answer, by name: a dict or a tuple has several; {}: it is odd."""
+    """Return the arrays in a user's answer, by name; {}: it is odd."""
     several: Iterable[tuple[Any, Any]] = [("", answer)]
     if isinstance(answer, Mapping):
         several = answer.items()

@@ -131,7 +131,7 @@ def _has_gsde(policy: Any) -> bool:
 
 
 def _reset_noise(policy: Any, n: int) -> None:
-    """Draw the noise of gSDE for n environments, outside of any graph."""
+    """Draw gSDE's noise of a Stable-Baselines3 policy for n environments, outside of any graph."""
     import torch
 
     if _has_gsde(policy):
@@ -242,7 +242,7 @@ def from_sb3(
 
 
 def _loaded(file: Path, algorithm: str | type | None) -> tuple[Any, str]:
-    """Return the model in a trusted file, and the file's checksum."""
+    """Return the Stable-Baselines3 model in a trusted file, and the file's checksum."""
     with needs_extra("a Stable-Baselines3 model", "sb3"):
         import stable_baselines3
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -289,7 +289,7 @@ def _statistics(normalize: Any, model: Any, file: Path | None, trust: bool) -> A
 
 
 def _learnable(model: Any, name: str, normalize: Any, options: dict[str, Any]) -> Learnable:
-    """Return the networks of a model.
+    """Return the networks of a Stable-Baselines3 model, for a skill that learns on.
 
     Raises:
         PolicyError: its networks are of another kind.
@@ -366,7 +366,7 @@ def _moments(normalize: Any, space: Space[Any]) -> tuple[Array, Array, float]:
 
 
 def _variance(rms: Any) -> Array:
-    """Return the variances in a ``RunningMeanStd``; 1 of constants, as in ``scale_of``.
+    """Return the variances in a ``VecNormalize``'s statistics; 1 of constants.
 
     It begins as if 1e-4 samples with mean 0 and variance 1 had been seen.
     """
@@ -381,7 +381,7 @@ def _variance(rms: Any) -> Array:
 
 
 def _mapping(model: Any, normalize: Any, options: dict[str, Any]) -> PolicyMapping:
-    """Return the declared mapping, with the statistics of ``VecNormalize`` in it."""
+    """Return the mapping declared for a Stable-Baselines3 model, with ``VecNormalize`` in it."""
     if normalize is None:
         return mapping_of("from_sb3()", **options)
     space: Any = model.observation_space
@@ -432,7 +432,7 @@ def _opened(file: Path, trust: bool, model: Any) -> Any:
 
 
 def _other_version(content: bytes, here: str) -> str:
-    """Return the likely reason why a file did not open; ``here``: the installed version."""
+    """Return the likely reason why a Stable-Baselines3 file did not open."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             saved = archive.read("_stable_baselines3_version").decode("ascii", "replace").strip()

@@ -155,7 +155,7 @@ def ready_selector(value: Any, skills: tuple[str, ...]) -> ReadySelector | None:
 
 
 class FunctionSelector(ReadySelector):
-    """A function from observations (n, *obs_shape) to skills (n,): names, or places in the list.
+    """A declared selector: a user's function of observations (n, *obs_shape) to skills (n,).
 
     If it needs a second argument, that is the ``LastCall``. Where skills have goals, it returns
     skills and goals: ``(names, goals)``, the goals (n, *goal_shape), or a dict of such goals by
@@ -179,6 +179,8 @@ class FunctionSelector(ReadySelector):
         return FunctionRule(*self._rule_of, Wrapped(self.function, self._ask), asks_last)
 
     def _ask(self, obs: Array, *last: LastCall) -> Any:
+        """Call the user's selector function; return skills, and goals if it gives some."""
+
         def convert(value: Any) -> Any:
             self.in_place.parted(value, len(obs))
             return value
@@ -191,7 +193,7 @@ class FunctionSelector(ReadySelector):
 
 
 class TreeSelector(ReadySelector):
-    """A behaviour tree as a policy over skills; see ``policies.selectors.Tree``.
+    """A declared behaviour tree as a selector; see ``policies.selectors.Tree``.
 
     Raises:
         DeclarationError: the tree has no skill.
@@ -224,6 +226,7 @@ class TreeSelector(ReadySelector):
         return selectors.Tree(*self._rule_of, self._node(self.root))
 
     def _node(self, node: Node) -> selectors.Node:
+        """Return a declared node of a behaviour tree as the one that acts."""
         if isinstance(node, Condition):
             return TreeCondition(node.name, checked_function(node.function, self._who, node.name))
         if isinstance(node, Composite):
@@ -248,7 +251,7 @@ class TreeSelector(ReadySelector):
 
 
 def _as_json(node: Node) -> Any:
-    """Return a node as JSON."""
+    """Return a node of a declared behaviour tree as JSON."""
     if isinstance(node, str):
         return node
     if isinstance(node, tuple):

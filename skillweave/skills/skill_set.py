@@ -36,7 +36,7 @@ class LimitedCalls(Choices):
 
 @dataclass(frozen=True)
 class SkillSet(LimitedCalls):
-    """Skills with their policies, and the limits of their calls; for ``acting_policy``."""
+    """The declared skills below a selector, with policies and limits; for ``acting_policy``."""
 
     skills: tuple[Skill, ...]
     policies: tuple[Any, ...]
@@ -99,7 +99,7 @@ def acting_policy(
     *,
     outermost: bool = True,
 ) -> RowPolicy:
-    """Return the policy of a selector and its skills, which act in calls, with reflexes.
+    """Compile a selector and its declared skills to the policy that acts in calls, with reflexes.
 
     Args:
         skills: with their policies; one that has skills and a selector itself is a hierarchy.
@@ -129,7 +129,7 @@ def acting_policy(
 
 
 def acting_alone(skills: SkillSet, i: int) -> RowPolicy:
-    """Return the policy of skill ``i`` without a selector, with reflexes."""
+    """Compile the declared skill ``i``, without a selector, to a policy with reflexes."""
     skill = skills.skills[i]
     space = skills.action_space
     policy = acting_apart(skills.policies[i], skill, skills.part(i), skills.reflexes, space)
@@ -145,7 +145,7 @@ def within(policy: RowPolicy) -> CallAndReturn:
 
 
 def in_place(policy: Any, who: str = "the policy's act()") -> RowPolicy:
-    """Return a policy of any form as a ``RowPolicy``; ``who`` is for messages."""
+    """Return a skill's policy, of any form, as a ``RowPolicy``; ``who`` is for messages."""
     if isinstance(policy, RowPolicy):
         return policy
     if isinstance(policy, Functional) and policy.is_plain:
@@ -161,7 +161,7 @@ def acting_apart(
     reflexes: tuple[Reflex, ...],
     space: gym.Space[Any],
 ) -> RowPolicy:
-    """Return the policy of a skill that acts by itself, or of a plain agent, with reflexes.
+    """Compile a declared skill that acts by itself, or a plain agent, to a policy with reflexes.
 
     Args:
         policy: the skill's; see ``policy_of``.
@@ -177,7 +177,7 @@ def acting_apart(
 def _overridden(
     policy: RowPolicy, reflexes: tuple[Reflex, ...], space: gym.Space[Any]
 ) -> RowPolicy:
-    """Return a policy with reflexes."""
+    """Return a policy with the declared reflexes around it."""
     acts = space_of(space)
     return Reflexes(policy, tuple(reflex.override(acts) for reflex in reflexes), acts)
 
@@ -190,6 +190,7 @@ def _whole(policy: Any, skill: Skill | None, part: OwnPart | None) -> RowPolicy:
 
 
 def _skill(skills: SkillSet, i: int) -> CalledSkill:
+    """Return a declared skill as the ``CalledSkill`` that acts in its hierarchy."""
     skill = skills.skills[i]
     path, goals = path_of(skill), goals_of(skill)
     policy = _whole(skills.policies[i], skill, skills.part(i))
@@ -241,7 +242,7 @@ ENDS = ("initiation", "termination", "success")
 
 
 def _check_memory(policy: RowPolicy) -> None:
-    """Raise a PolicyError where a checkpoint could not hold a policy's memory."""
+    """Raise a PolicyError where a checkpoint could not hold the memory of a user's policy."""
     if not isinstance(policy, Returns):
         return
     for name, value in policy.start(1).items():

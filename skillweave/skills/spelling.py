@@ -39,7 +39,7 @@ def misspelt(skill: Any, base: type, known: Iterable[str]) -> Iterator[tuple[str
 
 
 def _used(value: Any) -> set[str]:
-    """Return the names that a function, a property or a wrapped method reads."""
+    """Return the names that a method of a user's skill reads, which are not misspelt."""
     function: Callable[..., Any] | None = getattr(value, "fget", None)
     function = function or getattr(value, "__func__", None) or value
     code = getattr(function, "__code__", None)

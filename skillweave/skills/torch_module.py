@@ -369,6 +369,7 @@ def _program_of(program: Any) -> nn.Module:
             self.single = all(nodes[name].meta["val"].shape[:1] == (1,) for name in self.names)
 
         def forward(self, *given: Any, **named: Any) -> Any:
+            """Call the exported program, row by row where it takes one row at a time."""
             given = (*given, *(named.pop(name) for name in self.names if name in named))
             if not self.single or len(given[0]) == 1:
                 return self.inner(*given, **named)
@@ -383,6 +384,7 @@ def _program_of(program: Any) -> nn.Module:
 
 
 def _tensors(obs: Any, device: Any, dtype: Any) -> Any:
+    """Return observations as tensors for a user's module."""
     import torch
 
     if isinstance(obs, dict):

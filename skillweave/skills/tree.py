@@ -114,6 +114,7 @@ Node = str | tuple[str, Any] | Condition | Composite
 
 
 def _child(child: Any, where: str) -> Node:
+    """Return a declared child of a behaviour tree as a node."""
     if isinstance(child, str | Condition | Composite) or skill_and_goal(child)[1] is not None:
         node: Node = child
         return node

@@ -152,6 +152,7 @@ class _Leaf:
         return obs if self.place is None else obs[..., self.place].view(self.dtype)
 
     def vector(self, x: Tensor, lead: torch.Size) -> Tensor:
+        """Return a part of observations as floats for a network; choices are one-hot."""
         if not self.choices:
             return x.reshape(*lead, self.size).float()
         flat = x.reshape(*lead, len(self.choices)).long()

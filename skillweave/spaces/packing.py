@@ -154,6 +154,7 @@ def _unsupported(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str,
 
 
 def _is_supported(space: gym.Space[Any]) -> bool:
+    """Return whether observations of a space can be packed into one array."""
     try:
         obs_dtype(space)
     except EnvError:

@@ -124,6 +124,7 @@ class KeyDoor(gym.Env[Array, Array]):
         return canvas.frame()
 
     def _move(self, right: float, up: float) -> None:
+        """Move the agent as far as walls and the door let it."""
         x, y = self._place
         new_x = min(max(x + SPEED * min(max(right, -1.0), 1.0), -1.0), 1.0)
         new_y = min(max(y + SPEED * min(max(up, -1.0), 1.0), -1.0), 1.0)

@@ -247,6 +247,7 @@ class Evaluation:
         return joined([paragraph(self), *tables, *map(paragraph, lines)])
 
     def __str__(self) -> str:
+        """Return the line that an evaluation prints: return, success, shares of its skills."""
         j = self.to_json()
         digits = 2 if max(map(abs, self.returns)) < 10 else 1  # many are shares: 0 to 1
         n = len(self.returns)
@@ -282,7 +283,7 @@ def interquartile_mean(values: Array) -> float:
 
 
 def interquartile_means(values: Array) -> Array:
-    """Return interquartile means over the first axis of an array (n, …): (…)."""
+    """Return interquartile means of evaluations over the first axis of (n, …): (…)."""
     x = np.sort(np.asarray(values, float), axis=0)
     n = len(x)
     quarter = n / 4

@@ -180,7 +180,7 @@ def keep_to_guide(learner: RolloutLearner, target_kl: float | None) -> None:
 
 
 def adapted(coef: Tensor, kl: Tensor, target_kl: float) -> Tensor:
-    """Return the next coefficient of the KL to a guide, so that KL nears ``target_kl``; (P,) each.
+    """Return a learner's next coefficient of the KL to its guide, to near ``target_kl``; (P,).
 
     The rule of the adaptive penalty of Schulman et al. 2017, sec. 4.
     """

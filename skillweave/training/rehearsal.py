@@ -31,7 +31,7 @@ KIND = "rehearsal"
 
 
 def can_rehearse(algorithm: Algorithm) -> bool:
-    """Return whether an algorithm learns with a rehearsal: PPO without a memory.
+    """Return whether an algorithm learns with a repair's rehearsal: PPO without a memory.
 
     Algorithms of replay have no policy loss in which a nat has the same cost everywhere, and in a
     recurrent network an observation is not all that the policy sees.
@@ -80,7 +80,7 @@ def rehearse(learner: RolloutLearner, run: RunDirectory, entry: StageEntry, poli
 
 @torch.no_grad()
 def rehearsal_of(policy: AgentPolicy, obs: torch.Tensor, device: torch.device) -> Rehearsal:
-    """Return the rehearsal of a policy in observations (n, *obs_shape)."""
+    """Return the rehearsal for a repair of a policy in observations (n, *obs_shape)."""
     algorithm: Any = policy.algorithm
     state = algorithm.init([Seeds(0)])
     algorithm.set_weights(state, policy.weights)

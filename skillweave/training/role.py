@@ -20,7 +20,7 @@ from skillweave.skills.ready import has_part, own_part
 
 @dataclass(frozen=True)
 class Role:
-    """A skill, a selector or a critic of skills of a hierarchy; or a plain agent."""
+    """A role in training: a skill, a selector or a critic of skills; or a plain agent."""
 
     path: str
     kind: Literal["agent", "skill", "selector", "critic"]

@@ -131,7 +131,7 @@ class SkillReport:
 
 
 def skill_reports(calls: PlayedCalls) -> dict[str, SkillReport]:
-    """Return the report of each skill, by its path; those below a skill follow it.
+    """Return an evaluation's report on each skill, by its path; those below a skill follow it.
 
     Args:
         calls: with the skills' own rewards.
@@ -147,7 +147,7 @@ def skill_reports(calls: PlayedCalls) -> dict[str, SkillReport]:
 def _level_reports(
     calls: PlayedCalls, recorder: Recorder, time_limit: int
 ) -> dict[str, SkillReport]:
-    """Return the reports of the skills of one level, by their paths."""
+    """Return an evaluation's reports on the skills of one level, by their paths."""
     rows, skill, before = _with_before(recorder)
     skills = recorder.skills.skills
     alone = calls.alone is not None and not recorder.path
@@ -197,7 +197,7 @@ def _level_reports(
 
 
 def weak_handovers(calls: PlayedCalls) -> list[str]:
-    """Return sentences on skills that succeed much less often after one skill than elsewhere.
+    """Return an evaluation's sentences on skills that succeed less after one skill than elsewhere.
 
     Skills without ``success`` are left out.
     """
@@ -224,7 +224,7 @@ def _time_limit(rows: Array) -> int:
 
 
 def _began_late(recorder: Recorder, rows: Array, time_limit: int) -> Array:
-    """Return the calls of a level that began too late to count, (C,) bool."""
+    """Return the evaluated calls of a level that began too late to count, (C,) bool."""
     complete = (rows["end_reason"] == CallEnd.OWN) | rows["terminated"]
     was_cut = (rows["end_reason"] == CallEnd.EPISODE) & rows["truncated"] & ~rows["terminated"]
     limits = limits_of_choices(recorder.skills, recorder.limits)
@@ -233,7 +233,7 @@ def _began_late(recorder: Recorder, rows: Array, time_limit: int) -> Array:
 
 
 def _with_before(recorder: Recorder) -> tuple[Array, Array, Array]:
-    """Return the calls of a level by episode, and the skill of each and of the one before.
+    """Return the evaluated calls of a level by episode, each with its skill and the one before.
 
     The latter is a row of a ``Handover``, (C,): 0 where the episode starts.
     """
@@ -251,7 +251,7 @@ def _paths(calls: PlayedCalls, recorder: Recorder) -> tuple[str, ...]:
 
 
 def levels_of(skills: Mapping[str, SkillReport]) -> dict[str, dict[str, SkillReport]]:
-    """Return the reports grouped by the path of their hierarchy; "": the outermost."""
+    """Return an evaluation's reports on skills, grouped by the path of their hierarchy."""
     levels: dict[str, dict[str, SkillReport]] = {}
     for name, report in skills.items():
         levels.setdefault(level_of(name), {})[name] = report
@@ -283,7 +283,7 @@ IN_TEXT: Words = (_percent, _number, "last step")
 
 
 def skill_rows(skills: Mapping[str, SkillReport], words: Words = IN_TEXT) -> list[dict[str, Any]]:
-    """Return a row for each skill, in words but for ``share``, a number."""
+    """Return a row of an evaluation's table for each skill, in words but for ``share``."""
     percent, number, _ = words
     total = all_steps(skills)
     longest = max([10, *(report.length_mean or 0 for report in skills.values())])
@@ -305,7 +305,7 @@ def skill_rows(skills: Mapping[str, SkillReport], words: Words = IN_TEXT) -> lis
 def end_cells(
     reasons: Mapping[str, int], own_with_episode: int, calls: int, words: Words
 ) -> list[str]:
-    """Return the shares of the ends of calls; without ``reasons`` or calls, they are unknown."""
+    """Return cells of an evaluation's table of skills: how calls ended; perhaps unknown."""
     percent, _, last = words
     cells = [percent(reasons[why] / calls if reasons and calls else None) for why in ENDS.values()]
     if own_with_episode:
@@ -325,7 +325,7 @@ def skill_table(skills: Mapping[str, SkillReport]) -> str:
 
 
 def call_line(name: str, report: SkillReport, episodes: int) -> str:
-    """Return a part of a sentence on the calls of a skill that acts alone.
+    """Return an evaluation's words on the calls of a skill that acts alone.
 
     Args:
         episodes: that were played; the skill begins once in each, if it may.
@@ -352,7 +352,7 @@ def hints(skills: Mapping[str, SkillReport]) -> list[str]:
 
 
 def instant_calls(name: str, report: SkillReport) -> str:
-    """Return a sentence on a skill that ``cannot_last``."""
+    """Return an evaluation's sentence on a skill that ``cannot_last``."""
     return (
         f"Every call of {name!r} ({report.calls:,}) ended after one step: its termination() is "
         "true there. If that is so everywhere, its condition is wrong, and no call can do more."
@@ -360,7 +360,7 @@ def instant_calls(name: str, report: SkillReport) -> str:
 
 
 def reflex_lines(reflexes: Mapping[str, int], total: int) -> list[str]:
-    """Return a line for each reflex, with the share of ``total`` steps in which it acted."""
+    """Return an evaluation's line on each reflex, with its share of ``total`` steps."""
     return [
         f"reflex {name} acted in {steps:,} of {total:,} steps ({steps / total:.1%})"
         for name, steps in reflexes.items()
@@ -390,7 +390,7 @@ def idle_calls(skills: Mapping[str, SkillReport]) -> list[str]:
 
 
 def late_calls(skills: Mapping[str, SkillReport]) -> list[str]:
-    """Return a sentence on each skill with a quarter of its calls late, or more."""
+    """Return an evaluation's sentence on each skill with a quarter of its calls late, or more."""
     return [
         f"{report.late:,} of {report.calls:,} calls of {name!r} went on to their limit after they "
         "had succeeded. If its work is done then, let its termination() be True where success() "
@@ -401,7 +401,7 @@ def late_calls(skills: Mapping[str, SkillReport]) -> list[str]:
 
 
 def hasty_calls(skills: Mapping[str, SkillReport]) -> list[str]:
-    """Return a sentence on each skill with half of its calls hasty, or more.
+    """Return an evaluation's sentence on each skill with half of its calls hasty, or more.
 
     A move of one step with its own cost is included.
     """
@@ -431,7 +431,7 @@ def hasty_calls(skills: Mapping[str, SkillReport]) -> list[str]:
 def useless_skills(
     skills: Mapping[str, SkillReport], episodes: int, *, selector_learns: bool
 ) -> list[str]:
-    """Return a sentence on each skill that was never called, or whose calls never succeeded.
+    """Return an evaluation's sentence on each skill without calls, or without successful ones.
 
     Args:
         episodes: the number of episodes that were played.

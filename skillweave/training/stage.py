@@ -203,7 +203,7 @@ ONE = "one collector (EnvSpec(workers=1), --collectors 1, Ray(collectors=1))"
 
 
 def assign_workers(entries: Sequence[StageEntry], spec: EnvSpec, sent: Any = None) -> None:
-    """Write the number of processes for its environments into each stage's entry.
+    """Write into each stage's entry how many processes step its environments in training.
 
     For a population it is the number of parts into which its members are split; without a declared
     number they stay in this process. A measured number is lowered to one that divides ``num_envs``,

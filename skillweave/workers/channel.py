@@ -193,7 +193,7 @@ def channels(context: Any) -> tuple[Channel, Channel]:
 
 
 def _places(sizes: Sequence[int]) -> tuple[list[int], int]:
-    """Return the offsets of arrays of these sizes, and the size of all together, in bytes."""
+    """Return the offsets of a message's arrays in shared memory, and the size in bytes."""
     places, at = [], 0
     for size in sizes:
         places.append(at)
@@ -235,7 +235,7 @@ class _Storage:
 
 
 def _is_plain(tensor: Tensor) -> bool:
-    """Return True for a tensor of plain numbers in this process's memory."""
+    """Return True for a tensor of plain numbers, whose bytes a message can copy."""
     return (
         tensor.device.type == "cpu"
         and tensor.layout is torch.strided

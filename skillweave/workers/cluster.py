@@ -110,6 +110,7 @@ class Ray:
             def make_collectors(
                 make: MakeCollector, num_envs: int, workers: int, members: int, name: str
             ) -> CollectorGroup:
+                """Make collectors as actors of Ray, with equal shares of the environments."""
                 each = share_of(num_envs, workers, members, name)
                 elsewhere = actor_workers(actors, make, each, workers, name)
                 return WorkerCollectors(elsewhere, each, members, name)

@@ -247,7 +247,7 @@ _start_lock = threading.Lock()
 
 
 def _in_starter(start: Callable[[], None]) -> None:
-    """Start a process from a new thread, one process at a time.
+    """Start a worker process from a new thread, one at a time.
 
     A forked process continues as a copy of the thread that forks. If that thread has computed with
     several OpenMP threads, the copy still counts on them, and waits forever where the user's code
@@ -256,6 +256,7 @@ def _in_starter(start: Callable[[], None]) -> None:
     errors: list[BaseException] = []
 
     def run() -> None:
+        """Start the worker process in this thread; keep an error for the caller."""
         try:
             with _start_lock:
                 start()

@@ -26,7 +26,7 @@ _FOLDERS: list[str] = []
 
 
 def add_folder(folder: Path) -> None:
-    """Let files in a recipe's ``folder`` be imported by name: here, and where its code is sent.
+    """Let a recipe's ``folder`` be imported from: here, and in workers it is sent to.
 
     A folder that was added first keeps its place before later ones.
     """
@@ -62,7 +62,7 @@ def packed(thing: Any, who: str) -> bytes:
 
 
 def unpacked(data: bytes) -> Any:
-    """Invert ``packed``."""
+    """Return the object that ``packed`` made bytes of, for a worker or from one."""
     registered, algorithms, folders, thing = pickle.loads(data)
     for folder in folders:
         add_folder(Path(folder))
@@ -74,7 +74,7 @@ def unpacked(data: bytes) -> Any:
 
 @contextmanager
 def _own_code() -> Iterator[None]:
-    """Pickle modules by their content where they are not installed, for a block."""
+    """Pickle the user's modules by their content for a block, as workers lack their files."""
     known = cloudpickle.list_registry_pickle_by_value()
     # Each once: where a process was spawned, the user's script stands there by two names.
     modules = {id(m): m for m in list(sys.modules.values())}.values()  # not all have a hash
@@ -101,7 +101,7 @@ _PACKAGES = {"site-packages", "dist-packages"}  # of another environment, or of 
 
 
 def is_own_code(module: ModuleType) -> bool:
-    """Return whether a module is the user's own: no other machine has it installed."""
+    """Return whether workers must be sent a module: it is the user's, installed nowhere else."""
     name, file = getattr(module, "__name__", "__main__"), getattr(module, "__file__", None)
     if not isinstance(file, str) or name == "__main__" or sys.modules.get(name) is not module:
         return False
@@ -121,7 +121,7 @@ def _is_found(name: str, path: tuple[str, ...]) -> bool:
 
 @cache
 def _is_installed(file: str) -> bool:
-    """Return whether a file lies where packages are installed, here or anywhere."""
+    """Return whether a file is of an installed package, so workers need not be sent it."""
     path = Path(file).resolve()
     if _PACKAGES & set(path.parts):
         return True

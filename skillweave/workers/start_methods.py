@@ -68,7 +68,7 @@ def _is_imported(main: ModuleType) -> bool:
 
 
 def _line_of(main: ModuleType) -> int | None:
-    """Return the line of the main module that runs now; None if it has ended."""
+    """Return the line of the main module that runs now, and may start workers; None: ended."""
     frame: FrameType | None = sys._current_frames().get(threading.main_thread().ident or 0)
     while frame is not None:
         if frame.f_globals is vars(main) and frame.f_code.co_name == "<module>":
@@ -78,7 +78,7 @@ def _line_of(main: ModuleType) -> int | None:
 
 
 def _is_guarded(file: str, line: int) -> bool:
-    """Return True if a line of a file is in a block that only the program itself runs."""
+    """Return True if a line that starts workers is in a block that only the program runs."""
     try:
         tree = ast.parse(Path(file).read_bytes())
     except (OSError, SyntaxError, ValueError):
@@ -92,7 +92,7 @@ def _is_guarded(file: str, line: int) -> bool:
 
 
 def _asks_for_main(test: ast.expr) -> bool:
-    """Return True if a condition holds only in the program itself."""
+    """Return True if a condition holds only in the program itself, not in its workers."""
     if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.And):
         return any(map(_asks_for_main, test.values))
     return (

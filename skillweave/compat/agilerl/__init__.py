@@ -16,7 +16,7 @@ _messages: list[str] = []
 
 
 def stay_offline() -> None:
-    """Set wandb to offline if the user has no login, so that it does not request one.
+    """Set wandb to offline for AgileRL's scripts, if the user has no login.
 
     A line on stderr reports it, once, when wandb is imported.
     """

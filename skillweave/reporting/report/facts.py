@@ -100,6 +100,7 @@ def facts(run: RunDirectory) -> list[tuple[str, str]]:
 
 
 def _call_length(level: LevelEntry) -> str:
+    """Return words on the length of a level's calls, for reports and cards."""
     if level.call_lengths:
         return f"{plain(level.call_lengths)} steps at most, as the selector chooses"
     most = level.call_steps

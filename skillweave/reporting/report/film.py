@@ -60,6 +60,7 @@ def episode_shot(episode: Episode) -> Shot:
     """Return the shot of a whole episode, which has the same rewards and no earlier end."""
 
     def same(t: int, obs: Array, step: RawStep | None) -> bool:
+        """Return whether a step of the film's episode is as it was written down."""
         if step is None:
             return True
         over = bool(step.terminated[0] | step.truncated[0])
@@ -122,6 +123,7 @@ def _play(
     every: int,
     progress: EpisodeProgress,
 ) -> None:
+    """Play the actions of an episode again, and film every so many steps."""
     row = np.arange(1)
     step = None
     obs = engine.reset_some(row, [shot.seed])

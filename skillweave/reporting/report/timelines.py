@@ -62,6 +62,7 @@ def episode_data(
 def _episode(
     episode: Episode, number: int, first: int | None, named: ObsNames | None
 ) -> dict[str, Any]:
+    """Return an episode and its calls as data for the report's timelines."""
     calls = episode.calls[:MOST_CALLS_OF_ONE]
     sums = np.cumsum(episode.rewards, dtype=np.float64) if first is not None else ()
     entry: dict[str, Any] = {

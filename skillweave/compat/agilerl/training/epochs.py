@@ -89,6 +89,7 @@ class Epochs(SimpleNamespace):
         return loss
 
     def _report(self, number: int, tested: list[float], losses: list[Any]) -> None:
+        """Print and track the scores and fitness of AgileRL's agents."""
         scores = [float(np.mean(agent.scores[-self.evo_epochs :])) for agent in self.pop]
         if self.tracked:
             metrics = {"train/mean_score": np.mean(scores), "eval/mean_fitness": np.mean(tested)}

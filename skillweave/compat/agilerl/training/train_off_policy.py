@@ -45,6 +45,7 @@ def train_off_policy(
         epochs.pop = mutation.mutation(pop, pre_training_mut=True)
 
     def episode(agent: Any, past: int) -> float:
+        """Let an agent act and learn for an episode, by AgileRL's rules; return the mean loss."""
         losses = []
         how = () if noisy else (max(eps_end, eps_start * eps_decay**past),)
         for transition in epochs.steps(lambda state: agent.getAction(state, *how)):
