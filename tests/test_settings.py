@@ -32,7 +32,20 @@ from skillweave.algorithms.config import (
 )
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution import Evolution, Mutations, Range, Tournament
-from skillweave.schema import Check, annotations_of, described, fitted
+from skillweave.schema import (
+    Amount,
+    AtLeastOne,
+    Check,
+    Count,
+    Fraction,
+    NonNegative,
+    Positive,
+    Share,
+    Threads,
+    annotations_of,
+    described,
+    fitted,
+)
 
 if TYPE_CHECKING:
     from fractions import Fraction as Unknown
@@ -206,6 +219,82 @@ def test_every_number_has_bounds_but_those_that_may_be_any():
         hint = annotations_of(kind)[name]
         if any(part in (int, float) for part in inside(hint)) and not bounds(hint):
             assert (kind, name) in UNBOUNDED, (kind, name, hint)
+
+
+RANGES: dict[Any, str] = {
+    Fraction: (
+        "action_repeat activation architecture epsilon epsilon_final epsilon_fraction "
+        "exploration_final_eps exploration_fraction exploration_initial_eps gae_lambda gamma "
+        "hyperparameters layer_share none parameters priority_alpha priority_beta quota share "
+        "step tau"
+    ),
+    Share: ("target_success"),
+    Positive: (
+        "action_std_init actor_rate adam_eps clip_coef clip_value cpus ent_coef max_grad_norm "
+        "reference_kl target_kl update_ratio"
+    ),
+    NonNegative: (
+        "action_l2 call_cost end ent_coef ent_coef_final exploration_noise imitation_coef "
+        "imitation_vf_coef margin min_advantage_std patience start strength target_noise "
+        "target_noise_clip task_weight vf_coef"
+    ),
+    AtLeastOne: (
+        "batch_size checkpoint_every collectors episode_calls episodes eval_episodes "
+        "eval_every generations log_calls policy_delay population search_steps selector_steps "
+        "size skill_steps start_calls steps target_update_interval train_freq"
+    ),
+    Count: ("learning_starts"),
+    Amount: (
+        "action_repeat_steps batch_size imitation_steps n_step n_steps num_envs update_epochs"
+    ),
+    Threads: ("threads workers"),
+    bool: (
+        "check_seed compile deciding distributional double dueling elitism greedy_selector "
+        "greedy_skills interrupt layer_norm learn_ent_coef noisy normalize_advantage "
+        "normalize_obs normalize_returns normalize_rewards one_hot overlap prioritized "
+        "restrict save_buffer sees_goals squash_actions twin"
+    ),
+}
+"""The names of fields by what they hold, so that one kind is not taken for another."""
+WORDS: dict[str, set[tuple[str, ...]]] = {
+    "action_std": {("parameter", "state")},
+    "activation": {("tanh", "relu", "elu", "silu", "gelu")},
+    "compile": {("auto",)},
+    "device": {("cpu", "cuda", "auto")},
+    "engine": {("auto", "envpool", "sync")},
+    "keep": {("last", "best")},
+    "kind": {("lstm", "gru"), ("plain", "impala")},
+    "learn": {("together", "apart", "apart, then together")},
+    "learning_rate_schedule": {("constant", "linear"), ("constant", "linear", "kl")},
+    "loss": {("huber", "mse")},
+    "planes": {("first", "last")},
+    "scale": {("linear", "log", "complement")},
+    "start": {("config", "random")},
+}
+"""The words that fields take, by name; PPO has one more schedule than the others."""
+
+
+def options_of(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+
+
+def named(holds: Callable[[Any], bool]) -> set[str]:
+    """The names of fields of which one option holds."""
+    return {
+        name for kind, name in FIELDS if any(map(holds, options_of(annotations_of(kind)[name])))
+    }
+
+
+@pytest.mark.parametrize("kind", RANGES, ids=str)
+def test_a_field_holds_what_its_name_says(kind):
+    assert named(lambda option: option == kind) == set(RANGES[kind].split())
+
+
+@pytest.mark.parametrize("name", WORDS)
+def test_a_field_takes_these_words(name):
+    hints = [option for k, n in FIELDS if n == name for option in options_of(annotations_of(k)[n])]
+    assert {get_args(x) for x in hints if get_origin(x) is Literal} == WORDS[name]
+    assert named(lambda option: get_origin(option) is Literal) == set(WORDS)
 
 
 @pytest.mark.parametrize(("kind", "name"), FIELDS, ids=ids)
