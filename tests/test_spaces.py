@@ -81,33 +81,6 @@ def test_only_real_numbers_are_to_be_normalised():
     assert obs_codec(Dict({"a": Discrete(3), "b": Box(-1, 1, (2,))})).scaled
 
 
-PARTS = Dict({"a": Discrete(3, start=-1), "b": Box(-1, 1, (2,)), "c": MultiDiscrete([2, 4])})
-
-
-@pytest.mark.parametrize(
-    ("part", "value", "wrong"),
-    [
-        ("a", 1, None),
-        ("a", 2, "a choice that does not exist"),
-        ("a", -2, "a choice that does not exist"),
-        ("b", [5, -7], None),  # numbers outside a Box's bounds are common
-        ("b", [0, np.inf], "not finite"),
-        ("b", [np.nan, 0], "not finite"),
-        ("c", [1, 3], None),
-        ("c", [2, 0], "a choice that does not exist"),
-    ],
-)
-def test_raw_observations_are_checked_part_by_part(part, value, wrong):
-    given = {"a": [0, 1], "b": np.zeros((2, 2), np.float32), "c": np.zeros((2, 2), np.int64)}
-    given[part][1] = value
-    raw = to_tensor(pack(PARTS, {k: np.asarray(v) for k, v in given.items()}))
-    if wrong is None:
-        obs_codec(PARTS).check(raw)
-        return
-    with pytest.raises(ValueError, match=wrong):
-        obs_codec(PARTS).check(raw)
-
-
 def test_between_the_parts_of_an_observation_is_nothing():
     space = Dict({"a": Box(-1, 1, (2,), np.float64), "b": MultiBinary(3)})
     batched = {"a": np.ones((4, 2)), "b": np.ones((4, 3), np.int8)}

@@ -89,13 +89,18 @@ ROOMS: dict[str, set[str]] = {
     "recipes": {"shipped", "skillweave", "api", *USED},
     "compat": EVERYTHING | {"skillweave"},
     "cli": EVERYTHING | {"skillweave", "recipes", "compat"},  # import-agilerl converts files
-    "skillweave": EVERYTHING,  # the package itself: public names
+    "skillweave": EVERYTHING | {"types"},  # the package itself: public names
     "__main__": {"cli"},
 }
 # Modules with a row of their own. Settings, which help and errors read, need no torch.
 SETTINGS = {"errors", "policies.core", "messages", "schema", "named"}
 LEAVES: dict[str, set[str]] = {
-    "envs": {"public", "envs.pool", "hierarchy.options_env"},  # public names of users alone
+    "envs": {
+        "public",
+        "api.make_options",
+        "envs.pool",
+        "hierarchy.options_env",
+    },  # public names of users alone
     "networks.config": SETTINGS,
     "schema": {"errors", "messages", "arguments", "policies.untrusted"},
     "algorithms.schedules": SETTINGS,

@@ -12,8 +12,7 @@ import pytest
 import skillweave as sw
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
-from skillweave.policies.core import Around, RowPolicy, flat
-from skillweave.policies.parts import Corrects
+from skillweave.policies.core import Around, RowPolicy
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.skill_set import SkillSet
 from skillweave.types import Memoryless
@@ -214,14 +213,6 @@ def test_a_combinator_forwards_all_that_a_policy_has(name: str) -> None:
     answer = getattr(whole, name)(*given)
     assert calls == [given]
     assert answer == (None if name in ("observe", "check") else "answer")
-
-
-def test_a_correction_says_what_numbers_both_may_remember() -> None:
-    one = type("One", (RowPolicy,), {"start": lambda self, n: {"state": np.zeros(n, np.int64)},
-                                  "values": lambda self: {"state": range(3)}})  # fmt: skip
-    both = Corrects(one(), one(), None)  # type: ignore[arg-type]
-    assert both.values() == {"own.state": range(3), "base.state": range(3)}
-    assert both.values().keys() == flat(both.start(2)).keys()
 
 
 class Turns(Memoryless):
