@@ -44,7 +44,9 @@ class Export:
 def write_export(
     path: Path, policy: Policy, env: str, *, license: str = "", origin: str = ""
 ) -> Export:
-    """Write a policy for machines without this library; files of the same names are replaced.
+    """Write an export of a policy to a folder, for machines without this library.
+
+    Files of the same names are replaced.
 
     Args:
         path: the folder.

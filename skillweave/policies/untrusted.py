@@ -61,7 +61,7 @@ def check_file(path: Path, most: int | None = None) -> None:
 
 
 def read_file(path: Path, most: int | None = None) -> bytes:
-    """Return the content of a plain file that others may have made, with a bound.
+    """Return the content of a plain file, which may be damaged or hostile, up to a bound.
 
     Raises:
         RunError: it is missing, no plain file, too large, or cannot be read.

@@ -55,7 +55,7 @@ def other_goals(trained: gym.Space[Any], declared: gym.Space[Any]) -> str:
 def choice_space(
     choices: int, goal_spaces: Mapping[str, gym.Space[Any]], skills: Sequence[str]
 ) -> gym.Space[Any]:
-    """Return the space of a selector's choices: numbers, or numbers and goals.
+    """Return the space of the choices among declared skills: numbers, or numbers and goals.
 
     Args:
         choices: the number of skills, times lengths where these are chosen, too.

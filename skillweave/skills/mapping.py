@@ -23,7 +23,7 @@ from skillweave.schema import Check, fitted, settings
 
 
 def floats(value: Any) -> float | tuple[float, ...]:
-    """Return finite numbers of a declared mapping as floats; raise a ValueError: they are none."""
+    """Return numbers of a declared setting as finite floats; else raise a ValueError."""
     array = np.asarray(value, np.float64)
     if isinstance(value, str | bool) or array.ndim > 1 or not array.size:
         raise ValueError

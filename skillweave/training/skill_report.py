@@ -283,7 +283,7 @@ IN_TEXT: Words = (_percent, _number, "last step")
 
 
 def skill_rows(skills: Mapping[str, SkillReport], words: Words = IN_TEXT) -> list[dict[str, Any]]:
-    """Return a row of an evaluation's table for each skill, in words but for ``share``."""
+    """Return a row of a table of skills for each skill, in words but for ``share``."""
     percent, number, _ = words
     total = all_steps(skills)
     longest = max([10, *(report.length_mean or 0 for report in skills.values())])
@@ -305,7 +305,7 @@ def skill_rows(skills: Mapping[str, SkillReport], words: Words = IN_TEXT) -> lis
 def end_cells(
     reasons: Mapping[str, int], own_with_episode: int, calls: int, words: Words
 ) -> list[str]:
-    """Return cells of an evaluation's table of skills: how calls ended; perhaps unknown."""
+    """Return cells of a table of skills in evaluations and reports: how calls ended."""
     percent, _, last = words
     cells = [percent(reasons[why] / calls if reasons and calls else None) for why in ENDS.values()]
     if own_with_episode:

@@ -24,7 +24,7 @@ def learner_of(
     row_steps: int = 1,
     goes_on_at: int = 0,
 ) -> RolloutLearner | ReplayLearner:
-    """Return the learner of one stack.
+    """Return the learner of one stack of members in a stage, from rollouts or from replay.
 
     Args:
         quota: see ``RolloutLearner``; None: ``LEAST_SHARE`` of a rollout where a row is a step,
