@@ -57,8 +57,12 @@ REPLAY: dict[str, Any] = {
 
 
 def plain(algorithm: Any, env: Any = "CartPole-v1", steps: int = STEPS) -> Callable[[], Agent]:
-    """A declaration of a plain agent."""
-    return lambda: Agent(env, algorithm, steps, train_defaults=REPORTED)
+    """A declaration of a plain agent, in one process unless ``env`` says otherwise.
+
+    On a busy machine a measured number of processes may be another one from run to run.
+    """
+    spec = env if isinstance(env, EnvSpec) else EnvSpec(env, workers=1)
+    return lambda: Agent(spec, algorithm, steps, train_defaults=REPORTED)
 
 
 def in_a_pool() -> Agent:

@@ -297,7 +297,10 @@ LEARNERS = {
 }
 
 
-IMPORTS = {"    Apart, Network, PPO,": "    DQN, RNN, SAC, SelfImitationPPO, Apart, Network, PPO,"}
+IMPORTS = {
+    "    Apart, Network, PPO,": "    DQN, SAC, Apart, Network, PPO,",
+    "import numpy as np\n": "import numpy as np\nfrom skillweave.algorithms import RNN, SelfImitationPPO\n",
+}
 FEWER_STEPS = {
     "skill_steps=300": "skill_steps=200",
     "selector_steps=750": "selector_steps=400",
