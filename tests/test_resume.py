@@ -299,7 +299,9 @@ LEARNERS = {
 
 IMPORTS = {
     "    Apart, Network, PPO,": "    DQN, SAC, Apart, Network, PPO,",
-    "import numpy as np\n": "import numpy as np\nfrom skillweave.algorithms import RNN, SelfImitationPPO\n",
+    "import numpy as np\n": (
+        "import numpy as np\nfrom skillweave.algorithms import RNN, SelfImitationPPO\n"
+    ),
 }
 FEWER_STEPS = {
     "skill_steps=300": "skill_steps=200",
