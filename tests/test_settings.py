@@ -285,7 +285,7 @@ def named(holds: Callable[[Any], bool]) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("kind", RANGES, ids=str)
+@pytest.mark.parametrize("kind", RANGES, ids=described)
 def test_a_field_holds_what_its_name_says(kind):
     assert named(lambda option: option == kind) == set(RANGES[kind].split())
 
