@@ -234,7 +234,7 @@ RANGES: dict[Any, str] = {
         "reference_kl target_kl update_ratio"
     ),
     NonNegative: (
-        "action_l2 call_cost end ent_coef ent_coef_final exploration_noise imitation_coef "
+        "action_l2 deliberation_cost end ent_coef ent_coef_final exploration_noise imitation_coef "
         "imitation_vf_coef margin min_advantage_std patience start strength target_noise "
         "target_noise_clip task_weight vf_coef"
     ),
