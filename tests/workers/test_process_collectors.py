@@ -151,7 +151,7 @@ def test_processes_that_are_not_forked_get_the_users_code_and_stay(
 
 
 PARENT = """
-import os, signal, time
+import os, pathlib, signal, time
 from skillweave.workers import processes
 from skillweave.workers import worker_process
 from test_process_collectors import make_collectors, stepping
@@ -160,6 +160,9 @@ worker_process._tasks = lambda channel: (time.sleep(0.5), tasks(channel))[1]  # 
 found = make_collectors(stepping(), 3, 3, 1, "Walk")
 pids = [worker.process.pid for worker in found._workers]
 os.kill(pids[-1], signal.SIGSTOP)
+status = pathlib.Path(f"/proc/{pids[-1]}/status")
+while "State:\\tT" not in status.read_text():  # a busy machine takes its time to stop it
+    time.sleep(0.01)
 print(*pids, flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """
