@@ -181,13 +181,13 @@ class WatchedEngine:
         """Step environments ``ids`` (n,), also again, without an entry in the history."""
         raise NotImplementedError
 
-    def _begun(self, obs: Array, info: dict[str, Any], ids: Array) -> Array:
+    def _after_reset(self, obs: Array, info: dict[str, Any], ids: Array) -> Array:
         """Return observations after a reset, which are checked."""
         self._masks.see(info, ids, obs=obs)
         self._watch.check_reset(obs, ids)
         return obs
 
-    def _stepped(self, raw: RawStep, ids: Array) -> RawStep:
+    def _after_step(self, raw: RawStep, ids: Array) -> RawStep:
         """Return the result of a step, which is checked, and truncated after too many steps."""
         n = len(ids)
         over = raw.terminated | raw.truncated
@@ -310,7 +310,7 @@ class GymnasiumEngine(WatchedEngine):
         self._over[ids] = False
         if self._draws.looks:
             self._notice_draws()
-        return self._begun(obs, batched_infos(infos), ids)
+        return self._after_reset(obs, batched_infos(infos), ids)
 
     def _act(self, action: Array, ids: Array) -> RawStep:
         """Step environments ``ids`` (n,) one after another, and join their results."""
@@ -347,7 +347,7 @@ class GymnasiumEngine(WatchedEngine):
         if self._draws.looks:
             self._notice_draws()
         paid = reward.astype(np.float32)  # CheckedEnv has refused what would be an infinity
-        return self._stepped(RawStep(obs, paid, terminated, truncated, batched_infos(infos)), ids)
+        return self._after_step(RawStep(obs, paid, terminated, truncated, batched_infos(infos)), ids)
 
     def finish(self) -> None:
         """Check that training has left nothing in the environments; only ``close`` follows."""

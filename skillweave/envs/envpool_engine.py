@@ -152,7 +152,7 @@ class EnvPoolEngine(WatchedEngine):
             return pack(self.observation_space, obs), info
 
         obs, info = self._in_pools(ids, reset)
-        return self._begun(obs, info, ids)
+        return self._after_reset(obs, info, ids)
 
     def _act(self, action: Array, ids: Array) -> RawStep:
         """Step environments ``ids`` in their pools."""
@@ -165,7 +165,7 @@ class EnvPoolEngine(WatchedEngine):
 
         # An episode that terminates in the step of its time limit arrives as truncated: EnvPool
         # computes `terminated = done & ~truncated`, so the two cannot be distinguished.
-        return self._stepped(RawStep(*self._in_pools(ids, step)), ids)
+        return self._after_step(RawStep(*self._in_pools(ids, step)), ids)
 
     def _in_pools(
         self, ids: Array, call: Callable[[Any, Array], tuple[Any, ...]]

@@ -111,7 +111,7 @@ class Parts:
         """Restore a ``state``; return the environments that were reset, (k,)."""
         arrays = {k: v.numpy() for k, v in saved.items()}
         states = split_states(arrays, len(self._bounds) - 1)
-        ids = zip(self._workers.stand(states), self._bounds[:-1], strict=True)
+        ids = zip(self._workers.restore(states), self._bounds[:-1], strict=True)
         return np.concatenate([rows + first * self._each for rows, first in ids])
 
     def close(self) -> None:

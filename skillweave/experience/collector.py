@@ -56,8 +56,8 @@ class Collected:
     steps: int
     """Environment steps that were made for it, those of rows that are not valid included."""
     episodes: Array  # (K, 4 + I) float64, those that ended; NaN where there is no such number
-    stands: Array | None = None  # (N,) checksums of what the environments show now; of workers
-    begun_anew: Array = field(default_factory=lambda: np.empty(0, np.int64))
+    checksums: Array | None = None  # (N,) checksums of what the environments show now; of workers
+    restarted: Array = field(default_factory=lambda: np.empty(0, np.int64))
     """(k,) environments whose first row here does not follow from their last row before."""
     info_keys: frozenset[str] = frozenset()
     """Keys of ``info`` where episodes ended without a key that is logged."""

@@ -33,7 +33,7 @@ class CollectorGroup:
         self.members = members
         self.steps_made = 0
         """Environment steps that were made together."""
-        self.begun_anew = 0
+        self.restarts = 0
         """Environments that were lost with their worker, and did not repeat themselves."""
 
     def start(self, seeds: Seeds) -> None:
@@ -52,11 +52,10 @@ class CollectorGroup:
         """Restore the open episodes of ``state``; return (k,) environments that start again."""
         raise NotImplementedError
 
-    def differing(self) -> Array:
-        """(k,) environments that are not where they were, since they were lost with a worker.
+    def take_restarted(self) -> Array:
+        """Return the environments (k,) that could not be restored with a lost worker, each once.
 
-        Learners have seen them elsewhere, so what was open there must not go on. Each is
-        returned once.
+        Learners have seen them elsewhere, so their open episodes are cut.
         """
         return np.empty(0, np.int64)
 

@@ -343,8 +343,8 @@ class Agents:
         log = self.log
         best = self.best
         budget = self.entry.budget
-        log.report_reset(self.collectors.begun_anew, self.collectors.num_envs)
-        self.collectors.begun_anew = 0
+        log.report_reset(self.collectors.restarts, self.collectors.num_envs)
+        self.collectors.restarts = 0
         log.report_episodes(self.loop.episodes.tally, over=False)
         if tick.since < EARLY * budget <= tick.steps:
             self._report_not_called(tick.steps)
@@ -366,7 +366,7 @@ class Agents:
 
     def _on_checkpoint(self, saved: Saved) -> None:
         """Write a checkpoint; end where a callback ends the stage."""
-        self.log.stands(saved.at.update, saved.at.steps, saved.at.seconds)
+        self.log.set_counts(saved.at.update, saved.at.steps, saved.at.seconds)
         self.log.save(self._saved(saved.extra))
         if self.log.stop_requested:
             self.loop.end()

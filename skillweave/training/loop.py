@@ -191,8 +191,8 @@ class Loop:
         at.update += 1
         over = at.steps >= self.budget
         self.episodes.extend(collected.episodes, collected.info_keys, collected.longest)
-        if len(collected.begun_anew):
-            learner.cut(collected.begun_anew)
+        if len(collected.restarted):
+            learner.cut(collected.restarted)
         learner.take(collected.batches)
         if learner.overlap and not over:
             self._request()  # before the parameters change
@@ -275,9 +275,9 @@ class Loop:
         self._finish_update()
         if not all(bool(torch.isfinite(v).all()) for v in self.at.metrics.values()):
             return  # training has diverged, as the next report shows; keep the previous checkpoint
-        differing = self.collectors.differing()
-        if len(differing):
-            self.learner.cut(differing)
+        restarted = self.collectors.take_restarted()
+        if len(restarted):
+            self.learner.cut(restarted)
         arrays |= prefixed("episodes", self.episodes.state())
         tensors = {k: to_tensor(np.array(v)) for k, v in arrays.items()}
         extra = prefixed("collector", tensors) | prefixed("learner", self.learner.kept())

@@ -72,7 +72,7 @@ class StageLog:
     def tick(self, update: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Write the report of an update, and pass it to listeners."""
         name = self.entry.name
-        self.stands(update, steps, seconds)
+        self.set_counts(update, steps, seconds)
         self.at.metrics = metrics
         header = {"stage": name, "update": update, "steps": steps}
         self.run.log(header | {"seconds": round(seconds, 4)} | metrics)
@@ -84,7 +84,7 @@ class StageLog:
         """True if a callback has ended the stage."""
         return any(callback.stopped for callback in self._callbacks)
 
-    def stands(self, update: int, steps: int, seconds: float) -> None:
+    def set_counts(self, update: int, steps: int, seconds: float) -> None:
         """Set the counts of updates, steps and seconds for the next checkpoint."""
         self.at.update = update
         self.at.steps = steps

@@ -132,7 +132,7 @@ class WorkerHost:
         found: Collected = self.collector.collect(task.of_collector(self.number))
         kept = self.collector.kept  # where few observations are possible, they alone tell little
         about = np.column_stack([kept["age"], kept["sums"]])
-        found.stands = checksums(self.collector.obs) + checksums(about)
+        found.checksums = checksums(self.collector.obs) + checksums(about)
         return found
 
 
@@ -234,7 +234,7 @@ class Workers:
         self.past = [("restore", states)]
         return states
 
-    def stand(self, states: Sequence[dict[str, Array]]) -> list[Array]:
+    def restore(self, states: Sequence[dict[str, Array]]) -> list[Array]:
         """Restore the open episodes of each worker; return environments that start again."""
         self.past = []
         return self.ask("restore", states)
@@ -307,9 +307,9 @@ class WorkerCollectors(CollectorGroup):
         super().__init__(each * len(workers), members)
         self._workers = workers
         none = np.empty(0, np.int64)
-        self._stands = [none] * len(workers)  # of each, after what was collected last
-        self._differ = [none] * len(workers)  # of each, environments that did not repeat themselves
-        self._together = Workers(workers, name, each, self._did_again)
+        self._checksums = [none] * len(workers)  # of each, after what was collected last
+        self._restarted = [none] * len(workers)  # of each, what did not repeat itself
+        self._together = Workers(workers, name, each, self._note_restarted)
 
     def start(self, seeds: Seeds) -> None:
         """Start every environment, unless they have started."""
@@ -320,8 +320,8 @@ class WorkerCollectors(CollectorGroup):
         """Step each environment ``request.rows`` times, and return the joined rows."""
         task = self._workers[0].shared(request)
         answers: list[Collected] = self._together.ask("collect", [task] * len(self._workers))
-        self._stands = [answer.stands for answer in answers]  # type: ignore[misc]
-        found = replace(self._joined(answers), begun_anew=self.differing())
+        self._checksums = [answer.checksums for answer in answers]  # type: ignore[misc]
+        found = replace(self._joined(answers), restarted=self.take_restarted())
         if len(self._together.past) > SNAPSHOT_EVERY:
             self._together.states()
         return found
@@ -332,14 +332,14 @@ class WorkerCollectors(CollectorGroup):
 
     def restore(self, state: dict[str, Array]) -> Array:
         """Restore the open episodes of ``state``; return (k,) environments that start again."""
-        return self._columns(self._together.stand(split_states(state, len(self._workers))))
+        return self._columns(self._together.restore(split_states(state, len(self._workers))))
 
-    def differing(self) -> Array:
-        """Return the environments (k,) that are in another state since a worker was lost."""
-        found = self._columns(self._differ)
+    def take_restarted(self) -> Array:
+        """Return the environments (k,) that could not be restored with a lost worker, each once."""
+        found = self._columns(self._restarted)
         none = np.empty(0, np.int64)
-        self._differ = [none] * len(self._differ)
-        self.begun_anew += len(found)
+        self._restarted = [none] * len(self._restarted)
+        self.restarts += len(found)
         return found
 
     def finish(self) -> None:
@@ -353,10 +353,10 @@ class WorkerCollectors(CollectorGroup):
         """End the workers."""
         self._together.close()
 
-    def _did_again(self, what: str, found: dict[int, Any]) -> None:
+    def _note_restarted(self, what: str, found: dict[int, Any]) -> None:
         """Note which environments of workers that were made again stand elsewhere now."""
         for i, answer in found.items():
             if what == "restore":
-                self._differ[i] = answer
+                self._restarted[i] = answer
             elif what == "collect":
-                self._differ[i] = np.flatnonzero(answer.stands != self._stands[i])
+                self._restarted[i] = np.flatnonzero(answer.checksums != self._checksums[i])

@@ -289,7 +289,7 @@ def test_what_a_lost_worker_did_not_repeat_is_cut_before_rows_of_it_are_kept():
         answer = collect(request)
         lost = np.array([2, 5]) if called.count("collect") == 3 else np.empty(0, np.int64)
         called.append("collect")
-        return replace(answer, begun_anew=lost)
+        return replace(answer, restarted=lost)
 
     cut, take = found.learner.cut, found.learner.take
     found.collectors.collect = collected

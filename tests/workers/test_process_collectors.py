@@ -47,8 +47,8 @@ def in_processes():
 
 def same(one, two):
     equal(one, two)
-    assert not len(one.begun_anew)
-    assert not len(two.begun_anew)
+    assert not len(one.restarted)
+    assert not len(two.restarted)
 
 
 @pytest.mark.fast_cases(1)
@@ -102,15 +102,15 @@ def test_environments_that_do_not_repeat_themselves_are_told_where_a_worker_was_
     apart.start(Seeds(3))
     asked = requests(2)
     for _ in range(2):
-        assert not len(apart.collect(next(asked)).begun_anew)
+        assert not len(apart.collect(next(asked)).restarted)
     if after == "state":
         apart.state()
     victim = apart._workers[1].process
     os.kill(victim.pid, signal.SIGKILL)
     victim.join()
-    np.testing.assert_array_equal(apart.collect(next(asked)).begun_anew, [3, 4, 5])
-    assert not len(apart.collect(next(asked)).begun_anew)
-    assert apart.begun_anew == 3
+    np.testing.assert_array_equal(apart.collect(next(asked)).restarted, [3, 4, 5])
+    assert not len(apart.collect(next(asked)).restarted)
+    assert apart.restarts == 3
 
 
 def test_one_that_dies_in_the_middle_of_a_step_is_made_again(in_processes, tmp_path):
