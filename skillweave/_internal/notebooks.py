@@ -23,7 +23,7 @@ def in_notebook() -> bool:
 
 
 def table(head: Sequence[object], rows: Iterable[Sequence[object]], left: int = 1) -> Markup:
-    """Return a table.
+    """Return an HTML table, as notebooks show it.
 
     Args:
         head: the titles of the columns; none: the table has no titles.

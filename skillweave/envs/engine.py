@@ -347,7 +347,9 @@ class GymnasiumEngine(WatchedEngine):
         if self._draws.looks:
             self._notice_draws()
         paid = reward.astype(np.float32)  # CheckedEnv has refused what would be an infinity
-        return self._after_step(RawStep(obs, paid, terminated, truncated, batched_infos(infos)), ids)
+        return self._after_step(
+            RawStep(obs, paid, terminated, truncated, batched_infos(infos)), ids
+        )
 
     def finish(self) -> None:
         """Check that training has left nothing in the environments; only ``close`` follows."""

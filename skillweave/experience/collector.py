@@ -275,7 +275,7 @@ class Collector:
         other = np.flatnonzero(checksums(self.obs) != kept["obs"])
         ids = np.union1d(early, other)
         self._clear(ids)
-        return self._begin_anew(ids)
+        return self._reset(ids)
 
     def finish(self) -> None:
         """Check at the end of training what it has left in the environments."""
@@ -350,11 +350,11 @@ class Collector:
             out.write(over, next_obs=raw.next_obs[over])
         self.obs = raw.next_obs
         if len(over := np.flatnonzero(end)):
-            self._tell(out.row, over, raw.info)
+            self._record_episodes(out.row, over, raw.info)
         if self.search is not None and (len(over) or len(waiting)):
             assert step is not None
-            over = self._begun(end, over, waiting, step)
-        self._begin_anew(over)
+            over = self._start_calls(end, over, waiting, step)
+        self._reset(over)
         out.next(raw.info)
 
     def _searched(self, rows: Array, waiting: Array, turn: Turn) -> Array:
@@ -370,7 +370,7 @@ class Collector:
             action[rows] = own
         return action
 
-    def _begun(self, end: Array, over: Array, waiting: Array, step: Step) -> Array:
+    def _start_calls(self, end: Array, over: Array, waiting: Array, step: Step) -> Array:
         """Start new calls in episodes that go on, and continue the search for a start.
 
         Args:
@@ -500,7 +500,7 @@ class Collector:
         for name in self.after_request:
             self.kept[name][ids] = 0
 
-    def _begin_anew(self, ids: Array) -> Array:
+    def _reset(self, ids: Array) -> Array:
         """Reset environments ``ids`` (k,) and clear their memory; return them."""
         if len(ids):
             self.obs = self.obs.copy()
@@ -508,7 +508,7 @@ class Collector:
             self._forget(ids)
         return ids
 
-    def _tell(self, row: int, ids: Array, info: Mapping[str, Any]) -> None:
+    def _record_episodes(self, row: int, ids: Array, info: Mapping[str, Any]) -> None:
         """Record the episodes that have ended in environments ``ids`` (k,), for reports.
 
         Args:

@@ -124,7 +124,7 @@ class Channel:
         self._back = back
 
     def send(self, message: Any) -> None:
-        """Send anything that can be pickled.
+        """Send a message to the other process: anything that can be pickled.
 
         The other end must have received the message before: its arrays are overwritten.
 
