@@ -29,7 +29,7 @@ from small_runs import (
 )
 
 import skillweave as sw
-from skillweave import SAC, Agent, EnvSpec, Hierarchy, Network, Reflex, Run, SkillweaveError
+from skillweave import Agent, EnvSpec, Hierarchy, Run, SkillweaveError
 from skillweave._internal.prefixes import unprefixed
 from skillweave.cli.main import main
 from skillweave.errors import DeclarationError, RunError
@@ -148,20 +148,32 @@ def test_a_finished_run_learns_on_for_more_steps(kind: str, path: Path) -> None:
     assert policies(path) == done, "the same call again trains nothing"
 
 
-def test_more_steps_continue_from_all_that_was_learnt(path: Path) -> None:
-    train(path, 256)
+def test_more_steps_continue_from_all_that_was_learnt_with_new_episodes(
+    path: Path, tmp_path: Path
+) -> None:
+    train(path, 128)
     before = final(path)
-    train(path, 512)
+    train(path, 256)
     after = final(path)
     counts = [k for k in before if k in ("obs_count", "adam_step", "steps", "updates")]
     assert "obs_count" in counts
     for name in counts:
         assert float(after[name].max()) > float(before[name].max()), name
     assert before.keys() == after.keys()
+    train(tmp_path / "whole", 256)
+    mine, whole = (policies(p)["agent.safetensors"][1] for p in (path, tmp_path / "whole"))
+    assert mine != whole, "its episodes are those of the beginning"
 
 
 def test_a_run_that_a_callback_ended_learns_on(path: Path) -> None:
-    train(path, 512, callback=lambda event: event.steps < 200)
+    calls: list[TrainEvent] = []
+
+    def stop(event: TrainEvent) -> bool:
+        calls.append(event)
+        return event.steps < 200
+
+    train(path, 512, callback=stop)
+    assert [event.steps >= 200 for event in calls].count(True) == 1, "it is not called again"
     ended = stages(path)["agent"]
     assert 200 <= ended.steps < 512
     assert ended.stopped is not None
@@ -174,17 +186,6 @@ def test_a_run_that_a_callback_ended_learns_on(path: Path) -> None:
     assert after.continued == [ended.steps]
     assert after.stopped is None
     assert_metrics_rise(path)
-
-
-def test_a_callback_that_has_ended_a_stage_is_not_called_again(path: Path) -> None:
-    calls: list[TrainEvent] = []
-
-    def stop(event: TrainEvent) -> bool:
-        calls.append(event)
-        return event.steps < 200
-
-    train(path, 512, callback=stop)
-    assert [event.steps >= 200 for event in calls].count(True) == 1
 
 
 def test_an_error_of_a_callback_at_the_last_checkpoint_is_not_a_full_disk(path: Path) -> None:
@@ -235,16 +236,6 @@ def test_the_best_weights_of_before_are_kept_if_none_are_better(
     assert stages(path)["agent"].best == best
     assert policies(path) == kept
     assert not torch.equal(final(path)["params"], last)
-
-
-def test_new_episodes_are_not_those_of_the_beginning(path: Path, tmp_path: Path) -> None:
-    train(path, 128)
-    train(path, 256)
-    train(tmp_path / "whole", 256)
-    assert (
-        policies(path)["agent.safetensors"][1]
-        != policies(tmp_path / "whole")["agent.safetensors"][1]
-    )
 
 
 @pytest.mark.parametrize("kind", ["an agent with DQN", "apart"])
@@ -448,16 +439,9 @@ def test_a_stage_that_is_done_waits_for_the_end_of_its_run(path: Path, capfd) ->
 # Begin, or continue
 
 
-def test_resume_begins_where_there_is_nothing(path: Path, tmp_path: Path) -> None:
-    declare().train(path, seed=3, resume=True, quiet=True)
-    declare().train(tmp_path / "plain", seed=3, quiet=True)
-    assert_same(path, tmp_path / "plain")
-    before = policies(path)
-    declare().train(path, seed=3, resume=True, quiet=True)
-    assert policies(path) == before
-
-
-def test_resume_continues_what_was_stopped(path: Path, tmp_path: Path) -> None:
+def test_resume_begins_where_there_is_nothing_and_continues_what_was_stopped(
+    path: Path, tmp_path: Path
+) -> None:
     declare().train(tmp_path / "whole", checkpoint_every=64, quiet=True)
     for number in (1, 2):
         with interrupted(number):
@@ -475,17 +459,18 @@ def other_env() -> Hierarchy:
     return Hierarchy(spec, [Left(), Balance()], algorithm=ON, selector=ON, steps=256)
 
 
-def other_reflexes() -> Hierarchy:
-    def falls(obs: Any) -> Any:
-        return obs[:, 2] > 9.0
-
-    return declare(reflexes=[Reflex("falls", falls, 0)])
-
-
 def other_recipe() -> Hierarchy:
     found = declare()
     found.recipe = "other.py"
     return found
+
+
+@pytest.fixture(scope="module")
+def mine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of a recipe."""
+    declared = declare()
+    declared.recipe = "mine.py"
+    return declared.train(tmp_path_factory.mktemp("mine") / "run", quiet=True).path
 
 
 @pytest.mark.parametrize(
@@ -501,11 +486,9 @@ def other_recipe() -> Hierarchy:
     ],
 )
 def test_a_run_of_another_declaration_is_a_sentence(
-    path: Path, declared: Callable[[], Any], how: dict[str, Any], says: str
+    mine: Path, path: Path, declared: Callable[[], Any], how: dict[str, Any], says: str
 ) -> None:
-    mine = declare()
-    mine.recipe = "mine.py"
-    mine.train(path, quiet=True)
+    shutil.copytree(mine, path)
     before = (path / "run.json").read_bytes()
     with pytest.raises(SkillweaveError, match=says):
         declared().train(path, **{"resume": True, "quiet": True} | how)
@@ -530,29 +513,25 @@ def test_settings_that_differ_are_told(path: Path, capfd) -> None:
 
 
 def test_a_run_that_acts_by_data_is_loaded_without_its_declaration(path: Path) -> None:
-    run = sw.train_agent("CartPole-v1", ON, 128, path, quiet=True)
+    run = train(path, 128)
     found = sw.load(path)
     assert isinstance(found.declaration, Agent)
     assert found.evaluate(2, quiet=True) == run.evaluate(2, quiet=True)
-    spec = EnvSpec("CartPole-v1")
-    plain = Hierarchy(spec, [Left(), Push()], algorithm=ON, selector=ON, steps=128)
-    with pytest.raises(RunError, match="was declared in Python") as caught:
-        sw.load(plain.train(path.with_name("other"), quiet=True).path)
-    line = f'sw.load("{path.with_name("other")}", hierarchy)'
-    assert str(caught.value).endswith(line)
-    assert sw.load(path.with_name("other"), plain).hierarchy.skills
-
-
-def test_a_hierarchy_of_data_is_loaded_without_its_declaration(path: Path) -> None:
-    plain = Hierarchy("CartPole-v1", [Left()], algorithm=ON, selector=ON, steps=128)
-    run = plain.train(path, quiet=True)
-    found = sw.load(path)
+    data = Hierarchy("CartPole-v1", [Left()], algorithm=ON, selector=ON, steps=128)
+    run = data.train(path.with_name("data"), quiet=True)
+    found = sw.load(run.path)
     assert [skill.name for skill in found.hierarchy.skills] == ["left"]
     assert found.evaluate(2, quiet=True).returns == run.evaluate(2, quiet=True).returns
     with pytest.raises(DeclarationError, match="it must be the Hierarchy or Agent"):
-        sw.load(path, run)  # type: ignore[arg-type]
+        sw.load(run.path, run)  # type: ignore[arg-type]
     with pytest.raises(RunError, match="was trained with the skills"):
-        sw.load(path, declare())
+        sw.load(run.path, declare())
+    code = Hierarchy("CartPole-v1", [Left(), Push()], algorithm=ON, selector=ON, steps=128)
+    other = code.train(path.with_name("other"), quiet=True).path
+    with pytest.raises(RunError, match="was declared in Python") as caught:
+        sw.load(other)
+    assert str(caught.value).endswith(f'sw.load("{other}", hierarchy)')
+    assert sw.load(other, code).hierarchy.skills
 
 
 def test_code_that_a_run_names_is_not_executed(path: Path) -> None:
@@ -595,12 +574,3 @@ def test_the_command_line_begins_continues_and_gives_more_steps(
     shutil.rmtree("run/final")
     assert main([*train, "--set", "steps=512"]) == 1
     assert "skillweave train plain.py --start-from run" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_sac_learns_on(path: Path) -> None:
-    sac = SAC(num_envs=2, batch_size=16, learning_starts=20, network=Network((8,)))
-    for steps in (200, 300):
-        run = sw.train_agent("Pendulum-v1", sac, steps, path, resume=True, quiet=True)
-    assert stages(run)["agent"].continued == [200]
-    assert torch.isfinite(torch.tensor(run.evaluate(1, quiet=True).mean))
