@@ -49,7 +49,7 @@ def test_transitions_rewards_and_ends_by_hand():
     assert task.has_succeeded(state).tolist() == [True, False, False, False]
 
 
-def test_a_counter_counts_steps_without_a_gap_and_only_in_its_state():
+def test_counters_count_steps_without_a_gap_and_only_in_their_state():
     task = RewardMachine({("a", "b"): A, ("b", "c"): held(B, 3)}, accepting={"c"})
     state = task.start(1)
     seen = []
@@ -61,9 +61,7 @@ def test_a_counter_counts_steps_without_a_gap_and_only_in_its_state():
         ("a", 0, False), ("b", 0, False), ("b", 1, False), ("b", 2, False), ("b", 0, False),
         ("b", 1, False), ("b", 2, False), ("c", 0, True),
     ]  # fmt: skip
-
-
-def test_several_counters_in_one_state():
+    # Several of one state
     task = RewardMachine({("a", "x"): held(A, 2), ("a", "y"): held(B, 3)}, accepting={"x", "y"})
     state = task.start(3)
     for rows in ([[1, 1], [0, 1], [1, 0]], [[0, 1], [0, 1], [0, 1]], [[1, 1], [1, 1], [1, 1]]):
