@@ -44,11 +44,9 @@ def test_the_chance_is_that_of_the_logged_calls(share):
     assert expected.steps == 3
     assert ("-1" in expected.reason or "state" in expected.reason) == (share < 0.2)
     assert str(expected).startswith("a (2 steps) -> b (1 steps): a chance of ")
-
-
-def test_few_starts_make_a_wide_interval():
-    low, high = forecast(Planner(goes_right(0.5, 10), Mission(at(1)))).interval
-    assert high - low > 0.4
+    if share == 0.6:  # few starts make a wide interval
+        low, high = forecast(Planner(goes_right(share, 10), Mission(at(1)))).interval
+        assert high - low > 0.4
 
 
 def test_what_never_changes_in_an_episode_stays():

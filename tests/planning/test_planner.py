@@ -426,17 +426,14 @@ def test_a_call_says_what_its_skill_does_from_everywhere_that_it_passed():
     assert np.bincount(whole.graph.pieces.choice).tolist() == [1, 8]
 
 
-def test_neighbors_are_of_other_calls_each():
+def test_neighbors_are_of_other_calls_each_and_of_equally_near_ones_the_same():
     points = np.float32([[0], [0.1], [0.2], [1], [5], [6]])
     group = np.array([7, 7, 7, 8, 9, 9])
     near, far = nearest(points, np.float32([[0.12], [5.9]]), 4, group)
     assert near[:, :3].tolist() == [[1, 3, 4], [5, 3, 0]] or near[1, 2] == 2
     np.testing.assert_allclose(far[0, :3], [0.02, 0.88, 4.88], atol=1e-6)
     assert np.isinf(far[:, 3]).all()
-
-
-def test_of_equally_near_calls_the_same_ones_count():
-    """However they are searched: an export's runner must find the same ones."""
+    # However equally near ones are searched: an export's runner must find the same ones.
     points = np.float32([[x] for x in (2, *[1] * 12, *[0.999_999_9] * 12)])
     order = tie_order(len(points))
     found = order[np.isin(order, range(1, 13))][:5]

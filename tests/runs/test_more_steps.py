@@ -151,9 +151,10 @@ def test_a_finished_run_learns_on_for_more_steps(kind: str, path: Path) -> None:
 def test_more_steps_continue_from_all_that_was_learnt_with_new_episodes(
     path: Path, tmp_path: Path
 ) -> None:
-    train(path, 128)
+    train(path, 128).evaluate(1, save=True, quiet=True)
+    assert "evaluation" in agent(128).load(path).info()
     before = final(path)
-    train(path, 256)
+    assert "evaluation" not in train(path, 256).info(), "it is of the policy before"
     after = final(path)
     counts = [k for k in before if k in ("obs_count", "adam_step", "steps", "updates")]
     assert "obs_count" in counts
@@ -293,12 +294,6 @@ def test_a_run_killed_right_before_it_is_done_ends_the_same(
     assert_same(path, tmp_path / "whole")
 
 
-def test_an_evaluation_of_the_policy_before_is_removed(path: Path) -> None:
-    train(path, 128).evaluate(1, save=True, quiet=True)
-    assert "evaluation" in agent(128).load(path).info()
-    assert "evaluation" not in train(path, 256).info()
-
-
 def test_a_skill_that_learns_on_alone_makes_its_selector_old_and_it_is_said(
     path: Path, capfd
 ) -> None:
@@ -391,25 +386,21 @@ def test_a_policy_takes_the_place_of_final_states_on_a_full_disk(path: Path, cap
 # What cannot be given more steps
 
 
-def test_a_copy_without_final_states_names_start_from(path: Path, tmp_path: Path) -> None:
-    train(path, 128)
-    shutil.rmtree(path / "final")
-    with pytest.raises(RunError, match="final state") as caught:
-        train(path, 256)
-    line = f'agent.train(start_from="{path}")'
-    assert str(caught.value).endswith(line)
-    assert stages(path)["agent"].budget == 128
-    agent(128).train(tmp_path / "new", start_from=path, quiet=True)
-
-
-def test_a_damaged_final_state_changes_nothing(path: Path) -> None:
+def test_a_final_state_that_is_damaged_or_not_there_changes_nothing(
+    path: Path, tmp_path: Path
+) -> None:
     train(path, 128)
     file, before = path / "final/agent.safetensors", (path / "run.json").read_bytes()
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(RunError, match=r"final/agent\.safetensors is damaged"):
         train(path, 256)
+    shutil.rmtree(path / "final")
+    with pytest.raises(RunError, match="final state") as caught:
+        train(path, 256)
+    assert str(caught.value).endswith(f'agent.train(start_from="{path}")')
     assert (path / "run.json").read_bytes() == before
     assert agent(128).load(path).evaluate(1, quiet=True)
+    agent(128).train(tmp_path / "new", start_from=path, quiet=True)
 
 
 @pytest.mark.slow
@@ -534,15 +525,14 @@ def test_a_run_that_acts_by_data_is_loaded_without_its_declaration(path: Path) -
     assert sw.load(other, code).hierarchy.skills
 
 
-def test_code_that_a_run_names_is_not_executed(path: Path) -> None:
-    recipe, trap = path.with_name("trap.py"), path.with_name("sprung")
-    recipe.write_text(f"open({str(trap)!r}, 'w')")
-    declared = declare()
-    declared.recipe = str(recipe)
-    declared.train(path, quiet=True)
-    with pytest.raises(RunError, match=r"declared in .*trap\.py, and needs that code"):
-        sw.load(path)
-    assert not trap.exists()
+def test_code_that_a_run_names_is_not_executed(
+    mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text("open('sprung', 'w')")
+    with pytest.raises(RunError, match=r"declared in mine\.py, and needs that code"):
+        sw.load(mine)
+    assert not Path("sprung").exists()
 
 
 # The command line
