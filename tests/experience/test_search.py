@@ -14,6 +14,7 @@ from toys import alone_in, skills_of
 from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError, TrainingError
+from skillweave.experience import search
 from skillweave.experience.search import Search, Starts
 from skillweave.policies.core import World
 from skillweave.skills import Skill
@@ -92,7 +93,7 @@ def collector_of(
     return found
 
 
-def starts_of(collector, rows=1_500):
+def starts_of(collector, rows=900):
     found = collector.collect(next(requests(rows))).batches[""]
     before = np.concatenate([np.zeros((1, N), bool), found["valid"][:-1]])
     began = found["valid"] & (~before | (found["obs"][:, :, T] == 0))
@@ -116,12 +117,13 @@ def test_it_is_led_to_where_it_may_start_and_only_its_own_rows_are_valid():
 
 
 @pytest.mark.slow
-def test_where_no_starter_may_start_chance_acts():
+def test_where_no_starter_may_start_chance_acts(monkeypatch):
+    monkeypatch.setattr(search, "PATIENCE", 700)
     collector, asked = collector_of(OnlyFar), requests(600)
     first = collector.collect(replace(next(asked), record=("env_action",))).batches[""]
     assert len(np.unique(first["env_action"][~first["valid"]])) == 5
     with pytest.raises(SkillweaveError, match="steps of calling 'only_far'"):
-        collector.collect(next(requests(6_000)))
+        collector.collect(next(requests(1_000)))
 
 
 @pytest.mark.parametrize(
@@ -135,16 +137,17 @@ def test_where_no_starter_may_start_chance_acts():
         ),
     ],
 )
-def test_a_search_that_finds_nothing_says_so(kinds, how, says):
+def test_a_search_that_finds_nothing_says_so(kinds, how, says, monkeypatch):
+    monkeypatch.setattr(search, "PATIENCE", 600)
     collector = collector_of(*kinds, **how)
     with pytest.raises(TrainingError, match=says):
-        collector.collect(next(requests(8_000)))
+        collector.collect(next(requests(800)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kinds", "skill"), [((Five,), Anywhere), ((Five,), Far)])
 def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill):
-    calls = starts_of(collector_of(*kinds, skill=skill, start_calls=6), 6_000)[:, X] / 5
+    calls = starts_of(collector_of(*kinds, skill=skill, start_calls=6), 3_000)[:, X] / 5
     least = 4 if skill is Far else 0  # it may start at 20, after four calls
     counts = np.array([np.mean(calls == k) for k in range(7)])
     expected = np.where(np.arange(7) < least, 0, 1 / 7)
@@ -154,7 +157,8 @@ def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill
 
 
 @pytest.mark.slow
-def test_an_episode_in_which_it_may_not_start_begins_anew():
+def test_an_episode_in_which_it_may_not_start_begins_anew(monkeypatch):
+    monkeypatch.setattr(search, "PATIENCE", 900)
     found = collector_of(search_steps=9).collect(next(requests(200))).batches[""]
     assert not found["valid"].any()
     assert set(np.unique(found["obs"][:, :, T])) == set(range(9))
@@ -162,12 +166,12 @@ def test_an_episode_in_which_it_may_not_start_begins_anew():
     found = collector_of(Forward, search_steps=20).collect(next(requests(200))).batches[""]
     assert set(np.unique(found["obs"][:, :, T][found["valid"]])) == set(range(20, 25))
     with pytest.raises(SkillweaveError, match=r"reset after 19 of them \(search_steps\)"):
-        collector_of(Forward, search_steps=19).collect(next(requests(6_000)))
+        collector_of(Forward, search_steps=19).collect(next(requests(1_000)))
 
 
 def test_where_it_may_start_the_calls_that_come_first_take_their_time():
     collector = collector_of(Five, skill=Anywhere, start_calls=6, search_steps=3)
-    assert set(np.unique(starts_of(collector, 2_000)[:, X] / 5)) == set(range(7))
+    assert set(np.unique(starts_of(collector, 1_000)[:, X] / 5)) == set(range(7))
 
 
 def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
@@ -201,7 +205,7 @@ def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
 @pytest.mark.slow
 def test_an_episode_may_have_several_calls_with_those_of_others_between_them():
     collector = collector_of(Five, skill=Anywhere, start_calls=2, episode_calls=3)
-    found = collector.collect(next(requests(3_000))).batches[""]
+    found = collector.collect(next(requests(1_200))).batches[""]
     for n in range(N):
         clock, valid = found["obs"][:, n, T], found["valid"][:, n]
         ends = np.flatnonzero(valid & found["truncated"][:, n])
@@ -250,7 +254,7 @@ class OnTime(Skill):
 @pytest.mark.parametrize(("start_calls", "ends"), [(0, {4}), (2, {4, 19, 34})])
 def test_after_a_call_it_is_called_again_only_where_the_calls_between_lead_to(start_calls, ends):
     how = {"start_calls": start_calls, "episode_calls": 3, "search_steps": 9}
-    found = collector_of(Five, skill=OnTime, **how).collect(next(requests(2_000))).batches[""]
+    found = collector_of(Five, skill=OnTime, **how).collect(next(requests(800))).batches[""]
     at = found["obs"][:, :, T][found["valid"] & found["truncated"]]
     assert set(at) == ends
 
