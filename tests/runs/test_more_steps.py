@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 import torch
 from small_runs import (
-    MEMORY,
     OFF,
     ON,
     Balance,
@@ -45,6 +44,9 @@ from skillweave.types import TrainEvent
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 
 
+REPLAY = replace(OFF, update_ratio=0.25)
+
+
 def declare(steps: int = 256, **settings: Any) -> Hierarchy:
     own = {"algorithm": ON, "selector": ON, "learn": "apart"} | settings
     return Hierarchy(CARTPOLE, [Left(), Balance()], steps=steps, **own)
@@ -72,15 +74,12 @@ def final(path: Path) -> dict[str, torch.Tensor]:
 
 KINDS: dict[str, Callable[[int], Any]] = {
     "an agent with PPO": agent,
-    "an agent with DQN": lambda steps: agent(steps, OFF),
-    "an agent with a memory": lambda steps: agent(steps, MEMORY),
+    "an agent with DQN": lambda steps: agent(steps, REPLAY),
     "apart": declare,
     "together": lambda steps: declare(steps, learn="together"),
-    "together with DQN": lambda steps: declare(steps, learn="together", algorithm=OFF),
-    "apart with DQN": lambda steps: declare(steps, algorithm=OFF),
+    "together with DQN": lambda steps: declare(steps, learn="together", algorithm=REPLAY),
     "first apart": lambda steps: declare(steps, learn="apart, then together"),
     "nested apart": lambda steps: nested(steps, learn="apart"),
-    "nested together": lambda steps: nested(steps, learn="together"),
 }
 QUICK = ("an agent with PPO", "an agent with DQN")
 
@@ -276,7 +275,7 @@ def test_a_continuation_that_is_killed_at_once_continues(
 def test_a_run_killed_right_before_it_is_done_ends_the_same(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train(tmp_path / "whole", 256, OFF)
+    train(tmp_path / "whole", 256, REPLAY)
     keep = RunDirectory.keep_final
 
     def killed(self: RunDirectory, stage: str) -> None:
@@ -286,11 +285,11 @@ def test_a_run_killed_right_before_it_is_done_ends_the_same(
     with monkeypatch.context() as patched:
         patched.setattr(RunDirectory, "keep_final", killed)
         with pytest.raises(Stopped):
-            train(path, 256, OFF)
-    train(path, 256, OFF)
+            train(path, 256, REPLAY)
+    train(path, 256, REPLAY)
     assert_same(path, tmp_path / "whole")
-    train(path, 512, OFF)
-    train(tmp_path / "whole", 512, OFF)
+    train(path, 512, REPLAY)
+    train(tmp_path / "whole", 512, REPLAY)
     assert_same(path, tmp_path / "whole")
 
 
@@ -331,14 +330,14 @@ def test_a_small_replay_buffer_is_kept(
     path: Path, monkeypatch: pytest.MonkeyPatch, kept: bool
 ) -> None:
     monkeypatch.setattr(stage_log, "LARGEST_SPARE", 2**20 if kept else 100)
-    train(path, 256, OFF)
+    train(path, 256, REPLAY)
     names = RunDirectory.open(path).final_tensors("agent")
     assert any(".store." in name for name in names) == kept
     if not kept:
         with pytest.raises(RunError, match="would learn nothing in 20 more steps"):
-            train(path, 276, OFF)
+            train(path, 276, REPLAY)
     before = policies(path)
-    run = train(path, 384, OFF)
+    run = train(path, 384, REPLAY)
     assert stages(run)["agent"].steps == 384
     assert policies(path) != before
 
@@ -363,7 +362,7 @@ def test_a_full_disk_keeps_the_policy_and_says_what_is_not_kept(
     path: Path, capfd, allowed: int
 ) -> None:
     with full_disk(lambda target, data: "checkpoint" in target.name and len(data) > allowed):
-        run = agent(256, OFF).train(path)
+        run = agent(256, REPLAY).train(path)
     assert run.evaluate(1, quiet=True).mean > 0
     told = capfd.readouterr().err
     names = RunDirectory.open(path).final_tensors("agent")
@@ -371,7 +370,7 @@ def test_a_full_disk_keeps_the_policy_and_says_what_is_not_kept(
     assert ("its final state is not kept" in told) == (not names)
     if not names:
         with pytest.raises(RunError, match=r"final state.*start_from="):
-            train(path, 512, OFF)
+            train(path, 512, REPLAY)
 
 
 def test_a_policy_takes_the_place_of_final_states_on_a_full_disk(path: Path, capfd) -> None:

@@ -154,7 +154,7 @@ def test_a_resumed_run_keeps_the_same(kind, tmp_path, monkeypatch):
     stops = 0
     while True:
         with monkeypatch.context() as patch:
-            interrupt_at_checkpoint(patch, 2)
+            interrupt_at_checkpoint(patch, 3 if kind == "apart, then together" else 2)
             try:
                 if (tmp_path / "run").exists():
                     KINDS[kind]().resume(tmp_path / "run", quiet=True)
