@@ -877,8 +877,16 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ),
     # Trainings: what is logged and kept, and their targets
     ("DeclarationError", lambda: declare().train("runs/k", keep="bst"), "keep is 'bst'; it must"),
-    ("DeclarationError", lambda: declare().train("runs/l", log_info="fuel"), "log_info is 'fuel'"),
-    ("DeclarationError", lambda: declare().train("runs/l", log_info=["a", 3]), "log_info[1] is 3"),
+    (
+        "DeclarationError",
+        lambda: declare().train("runs/l", log_info="fuel"),
+        "log_info is 'fuel'; it must be a list of keys of info, such as ['",
+    ),
+    (
+        "DeclarationError",
+        lambda: declare().train("runs/l", log_info=["a", 3]),
+        "log_info[1] is 3; it must be a key of info, such as 'distance'",
+    ),
     ("DeclarationError", lambda: declare(skills=[skill(target_success=0.5)]), "define success()"),
 ]
 """The kind of the error, what is done, and words of its message."""
