@@ -444,6 +444,10 @@ MISTAKES: dict[str, dict[str, tuple[Callable[[], Any], str]]] = {
             lambda: (trained(), declare("Acrobot-v1").load("runs/ok")),
             "was trained on CartPole-v1",
         ),
+        "load of a hierarchy as an agent": (
+            lambda: (trained(), sw.Agent("CartPole-v1", SMALL, 64).load("runs/ok")),
+            "the run of a hierarchy, not of a plain agent",
+        ),
     },
 }
 """By the kind of the error: what is done, and words of its message."""
@@ -871,6 +875,19 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
         lambda: packed({"a": threading.Lock()}, "the arm"),
         "the arm cannot be sent",
     ),
+    # Trainings: what is logged and kept, and their targets
+    ("DeclarationError", lambda: declare().train("runs/k", keep="bst"), "keep is 'bst'; it must"),
+    (
+        "DeclarationError",
+        lambda: declare().train("runs/l", log_info="fuel"),
+        "log_info is 'fuel'; it must be a list of keys of info, such as ['",
+    ),
+    (
+        "DeclarationError",
+        lambda: declare().train("runs/l", log_info=["a", 3]),
+        "log_info[1] is 3; it must be a key of info, such as 'distance'",
+    ),
+    ("DeclarationError", lambda: declare(skills=[skill(target_success=0.5)]), "define success()"),
 ]
 """The kind of the error, what is done, and words of its message."""
 

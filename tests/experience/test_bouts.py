@@ -65,10 +65,19 @@ def test_a_bout_is_one_action_in_a_row_and_no_longer_than_it_may_be(steering):
     assert drawn.max() > 0.95
 
 
-def test_where_bouts_are_does_not_depend_on_how_rows_are_asked_for(steering):
+def test_where_bouts_are_depends_on_the_collector_and_not_on_how_rows_are_asked_for(steering):
     whole = played(*steering, 0, 3 * LONGEST)
     parts = [played(*steering, at, rows) for at, rows in ((0, 5), (5, 1), (6, 20), (26, 10))]
     np.testing.assert_array_equal(whole, np.concatenate(parts))
+    acting, params = steering
+    bouts = ActionRepeat(0, 0.5, LONGEST, Seeds(1))
+    request = Request(2 * LONGEST, (params,), np.ones(1), Seeds(2), action_repeat=bouts)
+    done = []
+    for number in (0, 1, 0):
+        acting.begin(request.of_collector(number))
+        done.append(np.stack([next_row(acting, OBS, None) for _ in range(LONGEST)]))
+    np.testing.assert_array_equal(done[0], done[2])
+    assert (done[0] != done[1]).any()
 
 
 def test_a_falling_chance_leaves_out_bouts_and_moves_none(steering):
@@ -80,14 +89,10 @@ def test_a_falling_chance_leaves_out_bouts_and_moves_none(steering):
     np.testing.assert_array_equal(few[forced], many[forced])
 
 
-def test_nobody_is_in_a_bout_who_acts_greedily(steering):
-    acting, params = steering
-    own = played(acting, params, 0, 1, chance=0.0)[0, 0]
-    done = played(acting, params, 0, 2 * LONGEST, chance=1.0, greedy=True)
+def test_nobody_is_in_a_bout_who_acts_greedily_or_at_random(steering):
+    own = played(*steering, 0, 1, chance=0.0)[0, 0]
+    done = played(*steering, 0, 2 * LONGEST, chance=1.0, greedy=True)
     assert (done == own).all()
-
-
-def test_nobody_is_in_a_bout_who_acts_at_random(steering):
     done = played(*steering, 0, 2 * LONGEST, chance=1.0, at_random=True)
     assert (done[1:] != done[:-1]).any(-1).all()
 
@@ -132,20 +137,3 @@ def test_a_forbidden_action_is_not_taken():
     mask[:, 3] = False
     done = played(acting, params, 0, 4 * LONGEST, chance=1.0, mask=mask)
     assert set(done.ravel()) == {0, 1, 2, 4}
-
-
-def test_collectors_have_bouts_of_their_own(steering):
-    acting, params = steering
-    request = Request(
-        2 * LONGEST,
-        (params,),
-        np.ones(1),
-        Seeds(2),
-        action_repeat=ActionRepeat(0, 0.5, LONGEST, Seeds(1)),
-    )
-    done = []
-    for number in (0, 1, 0):
-        acting.begin(request.of_collector(number))
-        done.append(np.stack([next_row(acting, OBS, None) for _ in range(LONGEST)]))
-    np.testing.assert_array_equal(done[0], done[2])
-    assert (done[0] != done[1]).any()

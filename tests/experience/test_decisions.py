@@ -6,7 +6,7 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from reference_calls import Counter, Die, Left, Right, T, Walk, Zigzag, scripted
+from reference_calls import Counter, Die, Left, Right, T, Walk, Zigzag
 from toy_acting import Again, Choices, Given, requests
 from toys import alone_in, calling_in, network_of, skills_of
 
@@ -92,41 +92,6 @@ def test_the_success_that_an_environment_tells_is_that_of_its_episode(of_selecto
 
 
 # What skills see -------------------------------------------------------------------------------
-
-
-SEEN = []
-"""What terminations were shown, a row for each step and environment."""
-
-
-class Shows(Skill):
-    max_steps = 3
-
-    def termination(self, step):
-        for i in range(len(step.reward)):
-            SEEN.append((
-                *step.obs[i].tolist(), int(step.action[i]), *step.next_obs[i].tolist(),
-                float(step.reward[i]), bool(step.terminated[i]), bool(step.truncated[i]),
-                bool(step.timed_out[i]), int(step.elapsed[i]), int(np.asarray(step.info["t"])[i]),
-            ))  # fmt: skip
-        return np.zeros(len(step.reward), bool)
-
-
-@pytest.mark.usefixtures("no_trials")
-def test_a_skill_sees_the_same_steps_under_a_selector_as_in_training():
-    seen = []
-    engine = make_engine(EnvSpec(Walk, engine="sync"), 200)
-    alone = alone_in(engine, Given(200), Shows())
-    alone.start(Seeds(7))
-    alone.acting.then = np.full(200, 2)
-    skills = SkillSet((Shows(),), (scripted(2),))
-    for collector in (alone, collector_of(skills, 200)):
-        SEEN.clear()
-        collector.collect(next(requests(3)))
-        seen.append(set(SEEN))
-    assert seen[0] == seen[1]
-    assert len(seen[0]) == 600
-    ends = [row for row in seen[0] if row[-2] == 3]
-    assert {row[-5] for row in ends} == {True, False}, "terminated on the skill's last step or not"
 
 
 class Nested(gym.Env):

@@ -303,16 +303,6 @@ def test_memory_starts_with_each_episode_also_where_the_call_ended_by_itself():
     assert not rows["truncated"][:-1].any()
 
 
-def test_no_environment_waits_and_every_step_has_one_owner():
-    collector = collector_of(Paid, 4, 3)
-    for request in itertools.islice(asked(ROWS, collector), 3):
-        collected = collector.collect(request)
-        assert collected.steps == ROWS * N
-        parts = collected.batches
-        owned = sum(parts[k]["valid"].astype(int) for k in ("up", "paid/down"))
-        assert owned.max() == 1
-
-
 def test_a_collector_goes_on_where_a_state_was_taken():
     other = collector_of(Paid, 4, 5, env=Again)
     first, second, third = itertools.islice(asked(17, other), 3)

@@ -223,7 +223,7 @@ JOINED = {
 
 
 @pytest.mark.fast_cases(4)
-@pytest.mark.parametrize("rows", [1, 6, 35])
+@pytest.mark.parametrize("rows", [1, 6, 17])
 @pytest.mark.parametrize("kind", JOINED)
 def test_joined_collectors_find_what_they_find_alone(kind, rows):
     make, which, actions = JOINED[kind]

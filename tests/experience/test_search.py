@@ -14,6 +14,7 @@ from toys import alone_in, skills_of
 from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError, TrainingError
+from skillweave.experience import search
 from skillweave.experience.search import Search, Starts
 from skillweave.policies.core import World
 from skillweave.skills import Skill
@@ -92,7 +93,7 @@ def collector_of(
     return found
 
 
-def starts_of(collector, rows=1_500):
+def starts_of(collector, rows=900):
     found = collector.collect(next(requests(rows))).batches[""]
     before = np.concatenate([np.zeros((1, N), bool), found["valid"][:-1]])
     began = found["valid"] & (~before | (found["obs"][:, :, T] == 0))
@@ -100,7 +101,7 @@ def starts_of(collector, rows=1_500):
 
 
 def test_it_is_led_to_where_it_may_start_and_only_its_own_rows_are_valid():
-    collected = collector_of(Forward).collect(next(requests(120)))
+    collected = collector_of(Forward).collect(next(requests(200)))
     experience = collected.batches[""]
     valid = experience["valid"]
     assert valid.any(0).all(), "chance alone would need 5^20 tries"
@@ -108,36 +109,45 @@ def test_it_is_led_to_where_it_may_start_and_only_its_own_rows_are_valid():
     assert (experience["obs"][1:][started][:, X] >= 20).all()
     led = ~valid & (experience["obs"][:, :, X] < 20)
     assert (experience["next_obs"][led][:, X] == experience["obs"][led][:, X] + 1).all()
-    assert collected.steps == 120 * N
-
-
-def test_each_of_its_ends_begins_anew_and_it_is_led_again():
-    experience = collector_of(Forward).collect(next(requests(200))).batches[""]
-    ends = experience["valid"] & (experience["terminated"] | experience["truncated"])
+    assert collected.steps == 200 * N
+    # After each of its ends an episode begins anew, and it is led again.
+    ends = valid & (experience["terminated"] | experience["truncated"])
     assert ends.sum() >= 2 * N
-    after = np.argwhere(ends[:-1])
-    assert all(experience["obs"][t + 1, n, T] == 0 for t, n in after)
+    assert all(experience["obs"][t + 1, n, T] == 0 for t, n in np.argwhere(ends[:-1]))
 
 
 @pytest.mark.slow
-def test_where_no_starter_may_start_chance_acts():
+def test_where_no_starter_may_start_chance_acts(monkeypatch):
+    monkeypatch.setattr(search, "PATIENCE", 700)
     collector, asked = collector_of(OnlyFar), requests(600)
     first = collector.collect(replace(next(asked), record=("env_action",))).batches[""]
     assert len(np.unique(first["env_action"][~first["valid"]])) == 5
     with pytest.raises(SkillweaveError, match="steps of calling 'only_far'"):
-        collector.collect(next(requests(6_000)))
+        collector.collect(next(requests(1_000)))
 
 
-def test_without_starters_it_says_that_chance_found_nothing():
-    collector = collector_of()
-    with pytest.raises(TrainingError, match="steps of random acting"):
-        collector.collect(next(requests(6_000)))
+@pytest.mark.parametrize(
+    ("kinds", "how", "says"),
+    [
+        ((), {}, "steps of random acting"),
+        (
+            (Five, OnlyFar),
+            {"skill": Anywhere, "after": ("only_far",)},
+            "is to start after a call of 'only_far'",
+        ),
+    ],
+)
+def test_a_search_that_finds_nothing_says_so(kinds, how, says, monkeypatch):
+    monkeypatch.setattr(search, "PATIENCE", 600)
+    collector = collector_of(*kinds, **how)
+    with pytest.raises(TrainingError, match=says):
+        collector.collect(next(requests(800)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kinds", "skill"), [((Five,), Anywhere), ((Five,), Far)])
 def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill):
-    calls = starts_of(collector_of(*kinds, skill=skill, start_calls=6), 6_000)[:, X] / 5
+    calls = starts_of(collector_of(*kinds, skill=skill, start_calls=6), 3_000)[:, X] / 5
     least = 4 if skill is Far else 0  # it may start at 20, after four calls
     counts = np.array([np.mean(calls == k) for k in range(7)])
     expected = np.where(np.arange(7) < least, 0, 1 / 7)
@@ -147,7 +157,8 @@ def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill
 
 
 @pytest.mark.slow
-def test_an_episode_in_which_it_may_not_start_begins_anew():
+def test_an_episode_in_which_it_may_not_start_begins_anew(monkeypatch):
+    monkeypatch.setattr(search, "PATIENCE", 900)
     found = collector_of(search_steps=9).collect(next(requests(200))).batches[""]
     assert not found["valid"].any()
     assert set(np.unique(found["obs"][:, :, T])) == set(range(9))
@@ -155,61 +166,12 @@ def test_an_episode_in_which_it_may_not_start_begins_anew():
     found = collector_of(Forward, search_steps=20).collect(next(requests(200))).batches[""]
     assert set(np.unique(found["obs"][:, :, T][found["valid"]])) == set(range(20, 25))
     with pytest.raises(SkillweaveError, match=r"reset after 19 of them \(search_steps\)"):
-        collector_of(Forward, search_steps=19).collect(next(requests(6_000)))
+        collector_of(Forward, search_steps=19).collect(next(requests(1_000)))
 
 
 def test_where_it_may_start_the_calls_that_come_first_take_their_time():
     collector = collector_of(Five, skill=Anywhere, start_calls=6, search_steps=3)
-    assert set(np.unique(starts_of(collector, 2_000)[:, X] / 5)) == set(range(7))
-
-
-@pytest.mark.parametrize(
-    ("rows", "start_calls", "search_steps"),
-    [
-        (7, 0, None),
-        (50, 0, None),
-        (7, 3, None),
-        (50, 3, None),
-        (7, 3, 23),
-    ],
-)
-def test_restored_in_the_middle_of_a_starters_call_it_goes_on_the_same(
-    rows, start_calls, search_steps
-):
-    how = {"start_calls": start_calls, "search_steps": search_steps}
-    goes_on_the_same(lambda: collector_of(Forward, **how), rows)
-
-
-@pytest.mark.parametrize("rows", [5, 9, 11])
-def test_restored_between_calls_of_one_episode_it_goes_on_the_same(rows):
-    def make():
-        return collector_of(Five, skill=Anywhere, start_calls=2, episode_calls=3)
-
-    kept = goes_on_the_same(make, rows)
-    assert kept["kept.calls_made"].any()
-
-
-def goes_on_the_same(make, rows):
-    """Cut after three rounds; returns what was kept there."""
-    first, asked = make(), requests(rows)
-    for request in itertools.islice(asked, 3):
-        first.collect(request)
-    again = make()
-    assert not len(again.restore(first.state()))
-    kept = first.state()
-    for request in itertools.islice(asked, 9):
-        one, two = first.collect(request).batches[""], again.collect(request).batches[""]
-        for name in ("obs", "action", "reward", "next_obs", "valid", "terminated", "truncated"):
-            np.testing.assert_array_equal(one.get(name), two.get(name))
-    return kept
-
-
-def test_others_over_other_environments_are_like_it():
-    first = collector_of(Five, skill=Anywhere, start_calls=2, episode_calls=3)
-    other = first.like(first.engine, first.acting)
-    assert {k: v.shape for k, v in other.kept.items()} == {
-        k: v.shape for k, v in first.kept.items()
-    }
+    assert set(np.unique(starts_of(collector, 1_000)[:, X] / 5)) == set(range(7))
 
 
 def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
@@ -243,7 +205,7 @@ def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
 @pytest.mark.slow
 def test_an_episode_may_have_several_calls_with_those_of_others_between_them():
     collector = collector_of(Five, skill=Anywhere, start_calls=2, episode_calls=3)
-    found = collector.collect(next(requests(3_000))).batches[""]
+    found = collector.collect(next(requests(1_200))).batches[""]
     for n in range(N):
         clock, valid = found["obs"][:, n, T], found["valid"][:, n]
         ends = np.flatnonzero(valid & found["truncated"][:, n])
@@ -292,7 +254,7 @@ class OnTime(Skill):
 @pytest.mark.parametrize(("start_calls", "ends"), [(0, {4}), (2, {4, 19, 34})])
 def test_after_a_call_it_is_called_again_only_where_the_calls_between_lead_to(start_calls, ends):
     how = {"start_calls": start_calls, "episode_calls": 3, "search_steps": 9}
-    found = collector_of(Five, skill=OnTime, **how).collect(next(requests(2_000))).batches[""]
+    found = collector_of(Five, skill=OnTime, **how).collect(next(requests(800))).batches[""]
     at = found["obs"][:, :, T][found["valid"] & found["truncated"]]
     assert set(at) == ends
 
@@ -343,21 +305,46 @@ def test_half_of_the_episodes_start_after_a_call_of_a_named_skill():
     starts = starts_of(named())
     assert set(starts[:, X]) == {0, 5}
     assert abs(np.mean(starts[:, X] == 5) - 0.5) < 0.12
-
-
-def test_calls_at_random_may_come_before_the_named_one():
-    starts = starts_of(named(start_calls=1))
-    ages = {(int(x), int(t)) for x, t in starts}
+    # Calls at random may come before the named one.
+    ages = {(int(x), int(t)) for x, t in starts_of(named(start_calls=1))}
     assert ages == {(0, 0), (0, 1), (5, 5), (5, 6), (10, 10)}
 
 
-@pytest.mark.parametrize("rows", [7, 50])
-def test_restored_before_a_named_call_it_goes_on_the_same(rows):
-    goes_on_the_same(lambda: named(start_calls=2), rows)
-    other = named(start_calls=2)
-    assert other.like(other.engine, other.acting).kept.keys() == other.kept.keys()
+BETWEEN = {"kinds": (Five,), "skill": Anywhere, "start_calls": 2, "episode_calls": 3}
+NAMED = {"kinds": (Five, Back), "skill": Anywhere, "start_calls": 2, "after": ("five",)}
 
 
-def test_where_the_named_skill_never_starts_it_is_said():
-    with pytest.raises(SkillweaveError, match="is to start after a call of 'only_far'"):
-        named(kinds=(Five, OnlyFar), after=("only_far",)).collect(next(requests(8_000)))
+@pytest.mark.parametrize(
+    ("how", "rows"),
+    [
+        ({}, 7),  # in the middle of a starter's call
+        ({}, 50),
+        ({"start_calls": 3}, 7),
+        ({"start_calls": 3}, 50),
+        ({"start_calls": 3, "search_steps": 23}, 7),
+        (BETWEEN, 5),  # between calls of one episode
+        (BETWEEN, 9),
+        (NAMED, 7),  # before a named call
+        (NAMED, 50),
+    ],
+)
+def test_one_that_is_restored_goes_on_the_same(how, rows):
+    def make():
+        more = {k: v for k, v in how.items() if k != "kinds"}
+        return collector_of(*how.get("kinds", (Forward,)), **more)
+
+    first, asked = make(), requests(rows)
+    for request in itertools.islice(asked, 3):
+        first.collect(request)
+    again, kept = make(), first.state()
+    assert not len(again.restore(kept))
+    assert how is not BETWEEN or kept["kept.calls_made"].any()
+    for request in itertools.islice(asked, 9):
+        one, two = first.collect(request).batches[""], again.collect(request).batches[""]
+        for name in ("obs", "action", "reward", "next_obs", "valid", "terminated", "truncated"):
+            np.testing.assert_array_equal(one.get(name), two.get(name))
+    # One over other environments keeps the same.
+    other = first.like(first.engine, first.acting)
+    assert {k: v.shape for k, v in other.kept.items()} == {
+        k: v.shape for k, v in first.kept.items()
+    }

@@ -406,14 +406,13 @@ class SourLater(Sour):
         return obs[:, TAG] != SourLater.shut
 
 
-def test_the_step_named_is_that_of_the_environment_named(collector):
+def test_the_step_and_environment_named_are_the_right_ones_also_where_others_search(
+    collector, monkeypatch
+):
     env = collector(skill=Sour())
     step(env, np.array([0, 1, 0]))  # environment 1 starts anew
     with pytest.raises(SkillweaveError, match="at step 1 for environment 1"):
         step(env, np.array([0, 2, 0]))
-
-
-def test_the_environment_named_is_the_right_one_where_others_search(collector, monkeypatch):
     monkeypatch.setattr(SourLater, "shut", collector().obs[0, TAG])
     env = collector(skill=SourLater())
     assert step(env, np.array([0, 1, 0])).batches[""]["valid"].tolist() == [[False, True, True]]

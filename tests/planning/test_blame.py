@@ -145,16 +145,12 @@ def test_only_what_the_first_skill_changes_is_held_against_it(decides, elsewhere
     assert f"in {found.rate:.0%} of 120 calls (" in str(found)
 
 
-def test_none_is_to_blame_where_it_works():
+def test_none_is_to_blame_where_it_works_and_an_event_judges_in_place_of_success():
     found = log("always").blame("b", "a")
     assert found.fine
     assert "neither skill is to blame" in str(found)
     assert log("never").blame("b", "start").fine
-
-
-def test_an_event_judges_in_place_of_success():
-    found = log("never").blame("b", "a", done={"b": lambda obs: obs[:, 0] < 0.4})
-    assert found.first
+    assert log("never").blame("b", "a", done={"b": lambda obs: obs[:, 0] < 0.4}).first
 
 
 def test_few_calls_do_not_tell():
@@ -162,9 +158,6 @@ def test_few_calls_do_not_tell():
     assert np.isnan(found.best)
     assert "too few calls to say which skill is to blame" in str(found)
     assert "'b' works at the start of an episode (100% of 8 calls" in str(found)
-
-
-def test_a_pair_without_a_call_is_said():
     with pytest.raises(RunError, match="no call of 'a' after a call of 'b'"):
         log("low").blame("a", "b")
 

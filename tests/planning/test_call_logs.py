@@ -10,18 +10,8 @@ import numpy as np
 import pytest
 import torch
 from goals.worlds import Point
-from ready_selectors.chain import (
-    DOOR,
-    KEY,
-    LAST,
-    NAMES,
-    SPEC,
-    GetKey,
-    Leave,
-    OpenDoor,
-    Wait,
-    hierarchy,
-)
+from planning.untrained import SKILLS, skill_set
+from ready_selectors.chain import DOOR, KEY, LAST, NAMES, SPEC, hierarchy
 from toys import skills_of
 
 from skillweave import Automaton, EnvSpec, Lengths
@@ -35,11 +25,6 @@ from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.skills.skill_set import SkillSet
 
 POINT = EnvSpec(lambda: Point(as_dict=True), engine="sync")  # observations are a Dict
-SKILLS = (GetKey(), OpenDoor(), Leave(), Wait())
-
-
-def skill_set(**how) -> SkillSet:
-    return skills_of(*SKILLS, **how)
 
 
 @pytest.fixture(scope="module")

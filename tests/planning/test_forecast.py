@@ -22,6 +22,7 @@ from skillweave.planning.forecast import forecast
 from skillweave.planning.lacking import asks_nothing
 
 pytestmark = pytest.mark.usefixtures("usual_forecasts")
+EPISODES = "skillweave.planning.forecast.EPISODES"
 A, B = 0, 1
 NINE, NOT_NINE = at(9), ~at(9)
 
@@ -43,11 +44,9 @@ def test_the_chance_is_that_of_the_logged_calls(share):
     assert expected.steps == 3
     assert ("-1" in expected.reason or "state" in expected.reason) == (share < 0.2)
     assert str(expected).startswith("a (2 steps) -> b (1 steps): a chance of ")
-
-
-def test_few_starts_make_a_wide_interval():
-    low, high = forecast(Planner(goes_right(0.5, 10), Mission(at(1)))).interval
-    assert high - low > 0.4
+    if share == 0.6:  # few starts make a wide interval
+        low, high = forecast(Planner(goes_right(share, 10), Mission(at(1)))).interval
+        assert high - low > 0.4
 
 
 def test_what_never_changes_in_an_episode_stays():
@@ -73,7 +72,8 @@ def test_what_never_changes_in_an_episode_stays():
         (Mission(at(1), at(2), held(at(0.5), 2)), ["at 0.5", "at 2"]),
     ],
 )
-def test_an_order_that_never_comes_is_named(task, words):
+def test_an_order_that_never_comes_is_named(task, words, monkeypatch):
+    monkeypatch.setattr(EPISODES, 20)
     steps = [(0, [(A, [0, 1], True, "own"), (B, [0.5, 2], True, "own")])]
     planner = Planner(log_of(["a", "b"], steps * 5), task)
     assert all(word in planner.obstacle for word in words)
@@ -90,7 +90,8 @@ def test_an_order_that_never_comes_is_named(task, words):
         GoalTask(lambda obs, goal: obs[:, 0] == goal[0], goal=[3]),
     ],
 )
-def test_what_the_log_allows_is_not_named(task):
+def test_what_the_log_allows_is_not_named(task, monkeypatch):
+    monkeypatch.setattr(EPISODES, 20)
     episodes = [
         (0, [(A, [1], True, "own"), (A, [1], True, "own"), (B, [2], True, "own")]),
         (1, [(B, [2], True, "own"), (A, [3], True, "own")]),

@@ -11,7 +11,7 @@ from planning.logs import log_of
 
 from skillweave.errors import DeclarationError, RunError
 from skillweave.planning import CallLog, held
-from skillweave.planning.handover import Handover, wilson
+from skillweave.planning.handover import Handover, _chance_of_fewer, wilson
 
 A, B = 0, 1
 
@@ -56,19 +56,15 @@ def test_done_may_be_an_event_inside_the_call(log):
     assert not matrix.began_late.any()  # no call of "stay" was done before it
 
 
-def test_intervals():
+def test_intervals_and_fishers_test():
     low, high = wilson([0, 5, 10, 0], [10, 10, 10, 0])
     # By Wilson's formula with 1.96, worked out elsewhere.
     np.testing.assert_allclose(low, [0, 0.2366, 0.7225, 0], atol=1e-3)
     np.testing.assert_allclose(high, [0.2775, 0.7634, 1, 1], atol=1e-3)
-
-
-def test_it_is_shown_as_a_table(log):
-    lines = str(log.handover()).splitlines()
-    assert lines[0].split() == ["after", "go", "stay"]
-    assert lines[2].split("  ")[-1].strip() == "50% of 2 (9% to 91%)"
-    assert lines[3].split()[-1] == "-"
-    assert "<table>" in log.handover()._repr_html_()
+    # The lady tasting tea: 8 cups, 4 of each kind, all right or one wrong.
+    assert _chance_of_fewer(0, 4, 4, 4) == pytest.approx(1 / 70)
+    assert _chance_of_fewer(1, 4, 3, 4) == pytest.approx(17 / 70)
+    assert _chance_of_fewer(4, 4, 4, 4) == pytest.approx(1.0)
 
 
 def walks(episodes: int, seed: int) -> CallLog:
@@ -162,15 +158,6 @@ def test_a_pair_with_few_calls_is_weak_where_chance_does_not_explain_it():
     assert weakest(600, 1000)
 
 
-def test_fishers_test_by_hand():
-    from skillweave.planning.handover import _chance_of_fewer
-
-    # The lady tasting tea: 8 cups, 4 of each kind, all right or one wrong.
-    assert _chance_of_fewer(0, 4, 4, 4) == pytest.approx(1 / 70)
-    assert _chance_of_fewer(1, 4, 3, 4) == pytest.approx(17 / 70)
-    assert _chance_of_fewer(4, 4, 4, 4) == pytest.approx(1.0)
-
-
 def test_noise_is_seldom_called_weak():
     rng, alarms = np.random.default_rng(0), 0
     for _ in range(200):
@@ -235,8 +222,13 @@ def test_a_call_does_not_forecast_itself():
     )  # fmt: skip
 
 
-def test_what_counts_without_a_success_is_said(log):
+def test_it_is_shown_as_a_table_and_says_what_counts_without_a_success(log):
     matrix = log.handover()
+    lines = str(matrix).splitlines()
+    assert lines[0].split() == ["after", "go", "stay"]
+    assert lines[2].split("  ")[-1].strip() == "50% of 2 (9% to 91%)"
+    assert lines[3].split()[-1] == "-"
+    assert "<table>" in matrix._repr_html_()
     assert matrix.by_itself == ()
     assert "A call is done if it succeeded." in str(matrix)
     assert str(matrix).endswith("time limit of 6 steps: 1 call.")
@@ -254,6 +246,9 @@ def test_sentences_of_chains_and_ends(log):
         "go: 67% (21% to 94%) along the logged calls; 67% as the product 67% of 3"
     )
     assert " then on: " in str(walks(60, 0).chain("back", "there", "on"))
+    assert "no product, as no logged call of 'stay' came right after and counts" in str(
+        log.chain("stay", "stay")
+    )
     assert str(log.call_ends("stay")) == (
         "stay: 4 calls of 2.5 steps, of which 50% succeeded; ends: own 0%, limit 75%, "
         "interrupted 0%, episode 25%"
@@ -281,21 +276,13 @@ def test_sentences_of_chains_and_ends(log):
             DeclarationError,
             "all features of skill 'go' are constant",
         ),
+        (
+            lambda log: replace(log, may_follow=log.may_follow & [True, False]).chain("go", "stay"),
+            RunError,
+            "'stay' may not start where any logged call of 'go'",
+        ),
     ],
 )
 def test_wrong_arguments_of_handover(log, make, kind, message):
     with pytest.raises(kind, match=message):
         make(log)
-
-
-def test_a_chain_whose_next_skill_may_never_start_is_refused(log):
-    may = log.may_follow.copy()
-    may[log.skill == A, B] = False
-    with pytest.raises(RunError, match=r"'stay' may not start where any logged call of 'go'"):
-        replace(log, may_follow=may).chain("go", "stay")
-
-
-def test_a_pair_without_a_call_has_no_product(log):
-    assert "no product, as no logged call of 'stay' came right after and counts" in str(
-        log.chain("stay", "stay")
-    )

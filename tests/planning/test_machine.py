@@ -49,7 +49,7 @@ def test_transitions_rewards_and_ends_by_hand():
     assert task.has_succeeded(state).tolist() == [True, False, False, False]
 
 
-def test_a_counter_counts_steps_without_a_gap_and_only_in_its_state():
+def test_counters_count_steps_without_a_gap_and_only_in_their_state():
     task = RewardMachine({("a", "b"): A, ("b", "c"): held(B, 3)}, accepting={"c"})
     state = task.start(1)
     seen = []
@@ -61,9 +61,7 @@ def test_a_counter_counts_steps_without_a_gap_and_only_in_its_state():
         ("a", 0, False), ("b", 0, False), ("b", 1, False), ("b", 2, False), ("b", 0, False),
         ("b", 1, False), ("b", 2, False), ("c", 0, True),
     ]  # fmt: skip
-
-
-def test_several_counters_in_one_state():
+    # Several of one state
     task = RewardMachine({("a", "x"): held(A, 2), ("a", "y"): held(B, 3)}, accepting={"x", "y"})
     state = task.start(3)
     for rows in ([[1, 1], [0, 1], [1, 0]], [[0, 1], [0, 1], [0, 1]], [[1, 1], [1, 1], [1, 1]]):
@@ -140,7 +138,8 @@ TASKS = {
 def test_its_automaton_is_in_the_same_states(name):
     task = TASKS[name]
     skills = {"a": "go_a", "b": ["go_b", "wait"], "c": "no", "d": "go_d", "e": "go_d"}
-    automaton = task.automaton(skills).among(("go_a", "go_b", "wait", "no", "go_d"))
+    declared = task.automaton(skills)
+    automaton = declared.among(("go_a", "go_b", "wait", "no", "go_d"))
     n = 200
     rng = np.random.default_rng(0)
     state, memory = task.start(n), automaton.start(n)
@@ -158,14 +157,11 @@ def test_its_automaton_is_in_the_same_states(name):
         assert names == wanted
         seen.update(names)
     assert len(seen) > 5
-
-
-def test_the_skills_of_its_automaton():
-    skills = {"a": "go_a", "b": ["go_b", "wait"], "c": "no", "d": "go_d", "e": "go_d"}
-    automaton = TASKS["several transitions"].automaton(skills)
-    assert automaton.states["a"] == ("go_a",)
-    assert automaton.states["b"] == automaton.states["b (2 steps held)"] == ("go_b", "wait", "go_d")
-    assert automaton.states["done"] == ("go_a", "go_b", "wait", "no", "go_d")
+    if name == "several transitions":
+        assert declared.states["a"] == ("go_a",)
+        held_b = ("go_b", "wait", "go_d")
+        assert declared.states["b"] == declared.states["b (2 steps held)"] == held_b
+        assert declared.states["done"] == ("go_a", "go_b", "wait", "no", "go_d")
 
 
 @pytest.mark.parametrize(

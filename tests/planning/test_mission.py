@@ -189,6 +189,8 @@ def test_texts_and_what_they_mean():
     assert Mission.from_text("a then b, repeat forever", NAMES).repeat is None
     task = Mission.from_text("stay then a", {"stay": held(P[1], 5), "a": P[0]})
     assert task.counter_steps[0, 0] == 5
+    # One of several ways may be avoided.
+    assert Mission(either(P[1], P[0]), avoid=P[0]).avoid == (P[0],)
 
 
 @pytest.mark.parametrize(
@@ -270,6 +272,17 @@ def test_equal_names_are_numbered_in_linear_time():
         (lambda: GoalTask(column(0)), "needs either goal= or columns="),
         (lambda: GoalTask(column(0), goal=[np.nan]), "one row of finite numbers"),
         (lambda: GoalTask(column(0), goal="x"), "give numbers"),
+        *(
+            (lambda goal=goal: GoalTask(column(0), goal=goal), "a goal is")
+            for goal in ("3", ["3"], [True], [[1.0]], [])
+        ),
+        *(
+            (
+                lambda legs=legs: Mission(*legs, avoid=P[0]),
+                "must be done and must be avoided",
+            )
+            for legs in ((P[0],), (P[1], [P[2], held(P[0], 3)]), (in_any_order(P[1], P[0]),))
+        ),
         (lambda: GoalTask(column(0), columns=(7,)).of(np.zeros((1, 3))), "have 3 numbers"),
     ],
 )
@@ -309,15 +322,3 @@ def test_goals():
     task = fixed.at(np.array([0.0]))
     assert task.step(task.start(2), step_to(obs))[2].tolist() == [True, True]
     assert Mission(reached(near, [4])).state_names == ("near(4)", "done")
-
-
-@pytest.mark.parametrize(
-    "legs", [(P[0],), (P[1], [P[2], held(P[0], 3)]), (in_any_order(P[1], P[0]),)]
-)
-def test_what_must_be_done_and_avoided_is_refused(legs):
-    with pytest.raises(DeclarationError, match="must be done and must be avoided"):
-        Mission(*legs, avoid=P[0])
-
-
-def test_one_of_several_ways_may_be_avoided():
-    assert Mission(either(P[1], P[0]), avoid=P[0]).avoid == (P[0],)

@@ -119,25 +119,6 @@ def test_rows_are_as_one_environment_each(name):
     assert len({str(choice) for choice in many[0]}) > (name != "goals of a guide")
 
 
-def bare(plans: Planned) -> Planned:
-    """The same plan with the user's own functions, as an export has it."""
-    features = tuple(
-        replace(own, look=None, function=own.function and own.function.bare)
-        for own in plans.features
-    )
-    events = tuple((event.bare, reads) for event, reads in plans.task.events)
-    task = replace(plans.task, events=events, rewards=tuple(r.bare for r in plans.task.rewards))
-    return replace(plans, features=features, task=task)
-
-
-@pytest.mark.parametrize("name", [name for name in PLANS if "observations" not in name])
-def test_its_data_are_all_that_it_needs(name):
-    planner = PLANS[name]()
-    plans, log = planner.in_place, planner.log
-    assert type(plans) is Planned
-    assert str(course(bare(plans), log, together)) == str(course(plans, log, together))
-
-
 def test_choices_with_goals_are_records_of_a_choice_space():
     planner = bound()
     plans = planner.in_place

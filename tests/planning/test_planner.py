@@ -11,7 +11,7 @@ import pytest
 from goals.worlds import Point
 from planning.logs import log_of
 from planning.steps import assert_not_repeated, at, step_to, watched
-from planning.test_call_logs import SKILLS, skill_set
+from planning.untrained import SKILLS, skill_set
 from ready_selectors.chain import (
     DOOR,
     KEY,
@@ -388,6 +388,7 @@ def test_exploring_reaches_further_than_chance():
     chance = record_calls(spec, skills, 2_400, num_envs=4)
     assert np.abs(seen.next_obs).max() > 1.5 * np.abs(chance.next_obs).max()
     assert explorer.new_share() < 0.3
+    assert record_calls(spec, skills, 40, choose="explore").steps >= 40
 
 
 def test_more_calls_than_a_graph_holds(log, monkeypatch):
@@ -425,17 +426,14 @@ def test_a_call_says_what_its_skill_does_from_everywhere_that_it_passed():
     assert np.bincount(whole.graph.pieces.choice).tolist() == [1, 8]
 
 
-def test_neighbors_are_of_other_calls_each():
+def test_neighbors_are_of_other_calls_each_and_of_equally_near_ones_the_same():
     points = np.float32([[0], [0.1], [0.2], [1], [5], [6]])
     group = np.array([7, 7, 7, 8, 9, 9])
     near, far = nearest(points, np.float32([[0.12], [5.9]]), 4, group)
     assert near[:, :3].tolist() == [[1, 3, 4], [5, 3, 0]] or near[1, 2] == 2
     np.testing.assert_allclose(far[0, :3], [0.02, 0.88, 4.88], atol=1e-6)
     assert np.isinf(far[:, 3]).all()
-
-
-def test_of_equally_near_calls_the_same_ones_count():
-    """However they are searched: an export's runner must find the same ones."""
+    # However equally near ones are searched: an export's runner must find the same ones.
     points = np.float32([[x] for x in (2, *[1] * 12, *[0.999_999_9] * 12)])
     order = tie_order(len(points))
     found = order[np.isin(order, range(1, 13))][:5]
@@ -472,7 +470,7 @@ def test_a_log_that_does_not_lead_there_says_so(log):
     Planner(log, Mission(either(never, has_key), avoid=beyond))
 
 
-def test_a_key_of_info_that_was_not_recorded_is_named(log):
+def test_what_a_predicate_cannot_read_is_named(log):
     def opened(step):
         return step.info["door"] == 1
 
@@ -482,9 +480,13 @@ def test_a_key_of_info_that_was_not_recorded_is_named(log):
         log.handover({"wait": opened})
     known = record_calls(SPEC, skill_set(), 500, info=["door"])
     assert Planner(known, Predicate(opened)).values(known.start[:1]).max() > 0
+    # A function of a step that is given observations
+    with pytest.raises(SkillError, match="its argument is not named 'step': write lambda step"):
+        Planner(log, lambda s: s.reward > 0)
+    Planner(log, lambda step: step.next_obs[:, KEY] == 1.0)
 
 
-def test_other_skills_and_spaces_are_refused(log):
+def test_other_skills_and_spaces_and_a_log_of_one_call_are_refused(log):
     planner = Planner(log, has_key)
     with pytest.raises(RunError, match="the hierarchy has a, b; record a log"):
         planner.among(("a", "b"))
@@ -493,6 +495,8 @@ def test_other_skills_and_spaces_are_refused(log):
         planner.among(log.skills).bind(box, gym.spaces.Discrete(4), "selector")
     with pytest.raises(RunError, match="'get_key' has changed since the log was recorded"):
         Planner(log, has_key, skills=skill_set(call_steps=3))
+    with pytest.raises(RunError, match="the log has 1 call, and nothing can be planned"):
+        Planner(log.take(np.array([0])), has_key)
 
 
 @pytest.mark.parametrize(
@@ -539,11 +543,6 @@ def test_wrong_arguments_of_an_explorer(how, message):
         Explorer(**how)
 
 
-def test_a_word_lets_it_explore():
-    seen = record_calls(SPEC, skill_set(), 400, num_envs=4, choose="explore")
-    assert seen.steps >= 400
-
-
 def test_observations_in_a_dict_are_planned_on():
     spec = EnvSpec(lambda: InDict(Corridor()), engine="sync")
     skills = pair_in(spec, 0, 2)
@@ -568,23 +567,6 @@ def test_images_need_features():
         Planner(log, task)
     planner = Planner(log, task, features=lambda obs: obs["place"][:, 0]).among(("left", "right"))
     assert planner.act(planner.start(1), log.start[:1])[0].tolist() == [1]
-
-
-def test_a_function_of_a_step_that_is_given_observations_is_explained(log):
-    with pytest.raises(SkillError, match="its argument is not named 'step': write lambda step"):
-        Planner(log, lambda s: s.reward > 0)
-    Planner(log, lambda step: step.next_obs[:, KEY] == 1.0)
-
-
-def test_a_goal_is_numbers():
-    for goal in ("3", ["3"], [True], [[1.0]], []):
-        with pytest.raises(DeclarationError, match="a goal is"):
-            GoalTask(lambda obs, goal: obs[:, 0] == goal, goal=goal)
-
-
-def test_a_log_of_one_call_is_refused(log):
-    with pytest.raises(RunError, match="the log has 1 call, and nothing can be planned"):
-        Planner(log.take(np.array([0])), has_key)
 
 
 def test_its_checksum_is_of_log_and_task(log):

@@ -10,12 +10,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from shared_runs import SMALL, Left, Right, declare
+from shared_runs import Left, Right, declare
 
 import skillweave as sw
 from skillweave.api import Run
 from skillweave.envs.engine import GymnasiumEngine
-from skillweave.errors import DeclarationError, Interrupted, RunError
+from skillweave.errors import Interrupted, RunError
 from skillweave.planning import CallLog, record_calls, run_log
 from skillweave.runs.directory import CALLS, RunDirectory
 
@@ -39,8 +39,9 @@ def tilted(obs):
 
 
 def test_calls_are_kept_and_joined(run):
-    with pytest.raises(RunError, match=r"has no log of calls; record a new log: run.log_calls"):
-        run.calls  # noqa: B018
+    for use in (lambda: run.calls, lambda: run.plan(tilted)):
+        with pytest.raises(RunError, match=r"has no log of calls; record a new log: run.log_calls"):
+            use()
     first = run.log_calls(300)
     assert same(run.calls, first)
     second = run.log_calls(200)
@@ -49,6 +50,7 @@ def test_calls_are_kept_and_joined(run):
     assert len(again) == len(first) + len(second)
     assert again.steps == first.steps + second.steps
     assert np.unique(again.episode).tolist() == list(range(again.episode.max() + 1))
+    assert len(run.plan(tilted).hierarchy.selector.log) == len(again), "a plan uses them"
 
 
 def test_the_same_recording_is_kept_once(run):
@@ -76,15 +78,6 @@ def test_episodes_are_played_again_from_their_seeds(run):
                 obs = engine.step(log.action[t][None], row).next_obs
                 assert (obs[0] == log.next_obs[t]).all()
     engine.close()
-
-
-def test_a_plan_uses_the_runs_own_calls(run):
-    with pytest.raises(RunError, match="has no log of calls"):
-        run.plan(tilted)
-    log = run.log_calls(1_000)
-    assert run.plan(tilted).evaluate(3, quiet=True).returns == (
-        run.plan(tilted, log).evaluate(3, quiet=True).returns
-    )
 
 
 def test_keys_of_info_of_earlier_calls_are_recorded_again():
@@ -215,13 +208,6 @@ def test_an_interrupted_recording_keeps_its_calls(run):
         run.log_calls(1_000_000, choose=choose, num_envs=4)
     assert 0 < run.calls.steps < 1_000_000
     assert (run.calls.end_reason > 0).all()
-
-
-def test_a_plain_agent_has_no_calls():
-    env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
-    agent = sw.train_agent(env, SMALL, 100, quiet=True)
-    with pytest.raises(DeclarationError, match="plain agent"):
-        agent.calls  # noqa: B018
 
 
 def test_calls_without_the_skills_code_are_replaced_by_calls_with_it(run):

@@ -125,6 +125,8 @@ def test_what_cannot_be_planned_is_refused(run, log, tmp_path):
     agent = Run(sw.Agent(SPEC, sw.PPO(), 10), tmp_path, run.policy)
     with pytest.raises(DeclarationError, match="no hierarchy"):
         agent.log_calls(10)
+    with pytest.raises(DeclarationError, match="plain agent"):
+        agent.calls  # noqa: B018
 
 
 def test_the_environment_of_a_task_by_hand():
@@ -194,22 +196,16 @@ def test_tasks_and_skills_go_by_the_environments_own_reward_and_success():
     )
 
 
-@pytest.mark.parametrize(
-    ("choose", "says"),
-    [
+def test_functions_choose_and_what_cannot_choose_is_refused(run):
+    log = run.log_calls(50, choose=lambda obs: ["wait"] * len(obs))
+    assert set(log.choice) == {3}
+    for choose, says in (
         (Explorer, "'random', 'explore', an Explorer"),
         (always(1), "among 4 skills"),
         (lambda obs: ["nobody"] * len(obs), "nobody"),
-    ],
-)
-def test_what_cannot_choose_is_refused(run, choose, says):
-    with pytest.raises(SkillweaveError, match=says):
-        run.log_calls(50, choose=choose)
-
-
-def test_functions_choose(run):
-    log = run.log_calls(50, choose=lambda obs: ["wait"] * len(obs))
-    assert set(log.choice) == {3}
+    ):
+        with pytest.raises(SkillweaveError, match=says):
+            run.log_calls(50, choose=choose)
     with pytest.raises(DeclarationError, match=r"info is 'door'; it must be a list"):
         run.log_calls(50, info="door")
     with pytest.raises(DeclarationError, match=r"join\(\[log"):

@@ -13,30 +13,23 @@ from skillweave.runs.manifest import Checkpoint
 
 
 @pytest.mark.parametrize(
-    ("recipe", "needs", "resume_needs", "evaluate", "resume"),
+    ("path", "recipe", "needs", "resume_needs", "evaluate", "resume"),
     [
-        ("lunar-lander", True, True, "", ""),  # a shipped one is found by its name
-        ("mine.py", True, True, " --recipe mine.py", " --recipe mine.py"),
-        ("mine.py", False, True, "", " --recipe mine.py"),
-        (None, True, True, " --recipe FILE.py", " --recipe FILE.py"),
-        (None, False, False, "", ""),
+        ("runs/a", "lunar-lander", True, True, "", ""),  # a shipped one is found by its name
+        ("runs/a", "mine.py", True, True, " --recipe mine.py", " --recipe mine.py"),
+        ("runs/a", "mine.py", False, True, "", " --recipe mine.py"),
+        ("runs/a", None, True, True, " --recipe FILE.py", " --recipe FILE.py"),
+        ("runs/a", None, False, False, "", ""),
+        ("'my runs/a'", "my file.py", False, True, "", " --recipe 'my file.py'"),
     ],
 )
 def test_commands_name_the_users_file_where_it_is_needed(
-    recipe, needs, resume_needs, evaluate, resume
+    path, recipe, needs, resume_needs, evaluate, resume
 ):
     told = small_manifest(recipe=recipe, needs_recipe=needs, resume_needs_recipe=resume_needs)
-    run = SimpleNamespace(path=Path("runs/a"), manifest=told)
-    assert command_words("evaluate|render", run) == f"skillweave evaluate|render runs/a{evaluate}"
-    assert command_words("resume", run) == f"skillweave resume runs/a{resume}"
-
-
-def test_paths_with_spaces_are_quoted():
-    run = SimpleNamespace(
-        path=Path("my runs/a"),
-        manifest=small_manifest(recipe="my file.py", resume_needs_recipe=True),
-    )
-    assert command_words("resume", run) == "skillweave resume 'my runs/a' --recipe 'my file.py'"
+    run = SimpleNamespace(path=Path(path.strip("'")), manifest=told)
+    assert command_words("evaluate|render", run) == f"skillweave evaluate|render {path}{evaluate}"
+    assert command_words("resume", run) == f"skillweave resume {path}{resume}"
 
 
 def test_what_is_saved_is_what_a_resumed_run_goes_on_from(tmp_path):

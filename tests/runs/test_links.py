@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from skillweave import Agent, SkillweaveError
-from skillweave.cli import main
 from skillweave.errors import RunError
 from tests.small_runs import ON, Stopped, policies, stop_at
 
@@ -109,16 +108,6 @@ def test_nothing_is_written_into_a_finished_run_with_a_link(runs, tmp_path, mine
     with pytest.raises(SkillweaveError, match="is a link to"):
         WRITES[how](run)
     assert content(mine) == before
-
-
-def test_a_score_is_told_where_the_run_has_a_link(runs, tmp_path, mine, capsys):
-    run = shutil.copytree(runs / "finished", tmp_path / "run")
-    link(run / "film.gif", mine / "thesis.txt")
-    assert main(["evaluate", str(run), "--episodes", "1"]) == 0
-    out, err = capsys.readouterr()
-    assert "over 1 episodes" in out
-    assert "the evaluation is not kept in the run: " in err
-    assert "film.gif is a link to" in err
 
 
 def test_a_run_may_be_reached_through_links(runs, tmp_path):

@@ -134,14 +134,6 @@ def test_files_without_which_there_is_no_run(name, runs, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_final_state_of_a_run_that_gets_more_steps(runs, tmp_path):
-    run = removed(runs, tmp_path, "finished", "final")
-    tree().load(run).evaluate(1, quiet=True)
-    with pytest.raises(SkillweaveError, match="does not hold the final state of stage"):
-        tree(2).train(run, resume=True, quiet=True)
-
-
-@pytest.mark.slow
 def test_the_lineage_of_a_population(tmp_path, capsys):
     run = agent(600).train(tmp_path / "run", quiet=True, evolve=Evolution(population=3)).path
     (run / "lineage.jsonl").unlink()

@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 import torch
 from small_runs import (
-    MEMORY,
     OFF,
     ON,
     Balance,
@@ -29,7 +28,7 @@ from small_runs import (
 )
 
 import skillweave as sw
-from skillweave import SAC, Agent, EnvSpec, Hierarchy, Network, Reflex, Run, SkillweaveError
+from skillweave import Agent, EnvSpec, Hierarchy, Run, SkillweaveError
 from skillweave._internal.prefixes import unprefixed
 from skillweave.cli.main import main
 from skillweave.errors import DeclarationError, RunError
@@ -43,6 +42,9 @@ from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.types import TrainEvent
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
+
+
+REPLAY = replace(OFF, update_ratio=0.25)
 
 
 def declare(steps: int = 256, **settings: Any) -> Hierarchy:
@@ -72,15 +74,12 @@ def final(path: Path) -> dict[str, torch.Tensor]:
 
 KINDS: dict[str, Callable[[int], Any]] = {
     "an agent with PPO": agent,
-    "an agent with DQN": lambda steps: agent(steps, OFF),
-    "an agent with a memory": lambda steps: agent(steps, MEMORY),
+    "an agent with DQN": lambda steps: agent(steps, REPLAY),
     "apart": declare,
     "together": lambda steps: declare(steps, learn="together"),
-    "together with DQN": lambda steps: declare(steps, learn="together", algorithm=OFF),
-    "apart with DQN": lambda steps: declare(steps, algorithm=OFF),
+    "together with DQN": lambda steps: declare(steps, learn="together", algorithm=REPLAY),
     "first apart": lambda steps: declare(steps, learn="apart, then together"),
     "nested apart": lambda steps: nested(steps, learn="apart"),
-    "nested together": lambda steps: nested(steps, learn="together"),
 }
 QUICK = ("an agent with PPO", "an agent with DQN")
 
@@ -148,20 +147,33 @@ def test_a_finished_run_learns_on_for_more_steps(kind: str, path: Path) -> None:
     assert policies(path) == done, "the same call again trains nothing"
 
 
-def test_more_steps_continue_from_all_that_was_learnt(path: Path) -> None:
-    train(path, 256)
+def test_more_steps_continue_from_all_that_was_learnt_with_new_episodes(
+    path: Path, tmp_path: Path
+) -> None:
+    train(path, 128).evaluate(1, save=True, quiet=True)
+    assert "evaluation" in agent(128).load(path).info()
     before = final(path)
-    train(path, 512)
+    assert "evaluation" not in train(path, 256).info(), "it is of the policy before"
     after = final(path)
     counts = [k for k in before if k in ("obs_count", "adam_step", "steps", "updates")]
     assert "obs_count" in counts
     for name in counts:
         assert float(after[name].max()) > float(before[name].max()), name
     assert before.keys() == after.keys()
+    train(tmp_path / "whole", 256)
+    mine, whole = (policies(p)["agent.safetensors"][1] for p in (path, tmp_path / "whole"))
+    assert mine != whole, "its episodes are those of the beginning"
 
 
 def test_a_run_that_a_callback_ended_learns_on(path: Path) -> None:
-    train(path, 512, callback=lambda event: event.steps < 200)
+    calls: list[TrainEvent] = []
+
+    def stop(event: TrainEvent) -> bool:
+        calls.append(event)
+        return event.steps < 200
+
+    train(path, 512, callback=stop)
+    assert [event.steps >= 200 for event in calls].count(True) == 1, "it is not called again"
     ended = stages(path)["agent"]
     assert 200 <= ended.steps < 512
     assert ended.stopped is not None
@@ -174,17 +186,6 @@ def test_a_run_that_a_callback_ended_learns_on(path: Path) -> None:
     assert after.continued == [ended.steps]
     assert after.stopped is None
     assert_metrics_rise(path)
-
-
-def test_a_callback_that_has_ended_a_stage_is_not_called_again(path: Path) -> None:
-    calls: list[TrainEvent] = []
-
-    def stop(event: TrainEvent) -> bool:
-        calls.append(event)
-        return event.steps < 200
-
-    train(path, 512, callback=stop)
-    assert [event.steps >= 200 for event in calls].count(True) == 1
 
 
 def test_an_error_of_a_callback_at_the_last_checkpoint_is_not_a_full_disk(path: Path) -> None:
@@ -237,16 +238,6 @@ def test_the_best_weights_of_before_are_kept_if_none_are_better(
     assert not torch.equal(final(path)["params"], last)
 
 
-def test_new_episodes_are_not_those_of_the_beginning(path: Path, tmp_path: Path) -> None:
-    train(path, 128)
-    train(path, 256)
-    train(tmp_path / "whole", 256)
-    assert (
-        policies(path)["agent.safetensors"][1]
-        != policies(tmp_path / "whole")["agent.safetensors"][1]
-    )
-
-
 @pytest.mark.parametrize("kind", ["an agent with DQN", "apart"])
 @pytest.mark.slow
 def test_a_continued_run_that_is_stopped_ends_the_same(kind: str, tmp_path: Path) -> None:
@@ -284,7 +275,7 @@ def test_a_continuation_that_is_killed_at_once_continues(
 def test_a_run_killed_right_before_it_is_done_ends_the_same(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train(tmp_path / "whole", 256, OFF)
+    train(tmp_path / "whole", 256, REPLAY)
     keep = RunDirectory.keep_final
 
     def killed(self: RunDirectory, stage: str) -> None:
@@ -294,18 +285,12 @@ def test_a_run_killed_right_before_it_is_done_ends_the_same(
     with monkeypatch.context() as patched:
         patched.setattr(RunDirectory, "keep_final", killed)
         with pytest.raises(Stopped):
-            train(path, 256, OFF)
-    train(path, 256, OFF)
+            train(path, 256, REPLAY)
+    train(path, 256, REPLAY)
     assert_same(path, tmp_path / "whole")
-    train(path, 512, OFF)
-    train(tmp_path / "whole", 512, OFF)
+    train(path, 512, REPLAY)
+    train(tmp_path / "whole", 512, REPLAY)
     assert_same(path, tmp_path / "whole")
-
-
-def test_an_evaluation_of_the_policy_before_is_removed(path: Path) -> None:
-    train(path, 128).evaluate(1, save=True, quiet=True)
-    assert "evaluation" in agent(128).load(path).info()
-    assert "evaluation" not in train(path, 256).info()
 
 
 def test_a_skill_that_learns_on_alone_makes_its_selector_old_and_it_is_said(
@@ -345,14 +330,14 @@ def test_a_small_replay_buffer_is_kept(
     path: Path, monkeypatch: pytest.MonkeyPatch, kept: bool
 ) -> None:
     monkeypatch.setattr(stage_log, "LARGEST_SPARE", 2**20 if kept else 100)
-    train(path, 256, OFF)
+    train(path, 256, REPLAY)
     names = RunDirectory.open(path).final_tensors("agent")
     assert any(".store." in name for name in names) == kept
     if not kept:
         with pytest.raises(RunError, match="would learn nothing in 20 more steps"):
-            train(path, 276, OFF)
+            train(path, 276, REPLAY)
     before = policies(path)
-    run = train(path, 384, OFF)
+    run = train(path, 384, REPLAY)
     assert stages(run)["agent"].steps == 384
     assert policies(path) != before
 
@@ -377,7 +362,7 @@ def test_a_full_disk_keeps_the_policy_and_says_what_is_not_kept(
     path: Path, capfd, allowed: int
 ) -> None:
     with full_disk(lambda target, data: "checkpoint" in target.name and len(data) > allowed):
-        run = agent(256, OFF).train(path)
+        run = agent(256, REPLAY).train(path)
     assert run.evaluate(1, quiet=True).mean > 0
     told = capfd.readouterr().err
     names = RunDirectory.open(path).final_tensors("agent")
@@ -385,7 +370,7 @@ def test_a_full_disk_keeps_the_policy_and_says_what_is_not_kept(
     assert ("its final state is not kept" in told) == (not names)
     if not names:
         with pytest.raises(RunError, match=r"final state.*start_from="):
-            train(path, 512, OFF)
+            train(path, 512, REPLAY)
 
 
 def test_a_policy_takes_the_place_of_final_states_on_a_full_disk(path: Path, capfd) -> None:
@@ -400,25 +385,21 @@ def test_a_policy_takes_the_place_of_final_states_on_a_full_disk(path: Path, cap
 # What cannot be given more steps
 
 
-def test_a_copy_without_final_states_names_start_from(path: Path, tmp_path: Path) -> None:
-    train(path, 128)
-    shutil.rmtree(path / "final")
-    with pytest.raises(RunError, match="final state") as caught:
-        train(path, 256)
-    line = f'agent.train(start_from="{path}")'
-    assert str(caught.value).endswith(line)
-    assert stages(path)["agent"].budget == 128
-    agent(128).train(tmp_path / "new", start_from=path, quiet=True)
-
-
-def test_a_damaged_final_state_changes_nothing(path: Path) -> None:
+def test_a_final_state_that_is_damaged_or_not_there_changes_nothing(
+    path: Path, tmp_path: Path
+) -> None:
     train(path, 128)
     file, before = path / "final/agent.safetensors", (path / "run.json").read_bytes()
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(RunError, match=r"final/agent\.safetensors is damaged"):
         train(path, 256)
+    shutil.rmtree(path / "final")
+    with pytest.raises(RunError, match="final state") as caught:
+        train(path, 256)
+    assert str(caught.value).endswith(f'agent.train(start_from="{path}")')
     assert (path / "run.json").read_bytes() == before
     assert agent(128).load(path).evaluate(1, quiet=True)
+    agent(128).train(tmp_path / "new", start_from=path, quiet=True)
 
 
 @pytest.mark.slow
@@ -448,16 +429,9 @@ def test_a_stage_that_is_done_waits_for_the_end_of_its_run(path: Path, capfd) ->
 # Begin, or continue
 
 
-def test_resume_begins_where_there_is_nothing(path: Path, tmp_path: Path) -> None:
-    declare().train(path, seed=3, resume=True, quiet=True)
-    declare().train(tmp_path / "plain", seed=3, quiet=True)
-    assert_same(path, tmp_path / "plain")
-    before = policies(path)
-    declare().train(path, seed=3, resume=True, quiet=True)
-    assert policies(path) == before
-
-
-def test_resume_continues_what_was_stopped(path: Path, tmp_path: Path) -> None:
+def test_resume_begins_where_there_is_nothing_and_continues_what_was_stopped(
+    path: Path, tmp_path: Path
+) -> None:
     declare().train(tmp_path / "whole", checkpoint_every=64, quiet=True)
     for number in (1, 2):
         with interrupted(number):
@@ -475,17 +449,18 @@ def other_env() -> Hierarchy:
     return Hierarchy(spec, [Left(), Balance()], algorithm=ON, selector=ON, steps=256)
 
 
-def other_reflexes() -> Hierarchy:
-    def falls(obs: Any) -> Any:
-        return obs[:, 2] > 9.0
-
-    return declare(reflexes=[Reflex("falls", falls, 0)])
-
-
 def other_recipe() -> Hierarchy:
     found = declare()
     found.recipe = "other.py"
     return found
+
+
+@pytest.fixture(scope="module")
+def mine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of a recipe."""
+    declared = declare()
+    declared.recipe = "mine.py"
+    return declared.train(tmp_path_factory.mktemp("mine") / "run", quiet=True).path
 
 
 @pytest.mark.parametrize(
@@ -501,11 +476,9 @@ def other_recipe() -> Hierarchy:
     ],
 )
 def test_a_run_of_another_declaration_is_a_sentence(
-    path: Path, declared: Callable[[], Any], how: dict[str, Any], says: str
+    mine: Path, path: Path, declared: Callable[[], Any], how: dict[str, Any], says: str
 ) -> None:
-    mine = declare()
-    mine.recipe = "mine.py"
-    mine.train(path, quiet=True)
+    shutil.copytree(mine, path)
     before = (path / "run.json").read_bytes()
     with pytest.raises(SkillweaveError, match=says):
         declared().train(path, **{"resume": True, "quiet": True} | how)
@@ -530,40 +503,35 @@ def test_settings_that_differ_are_told(path: Path, capfd) -> None:
 
 
 def test_a_run_that_acts_by_data_is_loaded_without_its_declaration(path: Path) -> None:
-    run = sw.train_agent("CartPole-v1", ON, 128, path, quiet=True)
+    run = train(path, 128)
     found = sw.load(path)
     assert isinstance(found.declaration, Agent)
     assert found.evaluate(2, quiet=True) == run.evaluate(2, quiet=True)
-    spec = EnvSpec("CartPole-v1")
-    plain = Hierarchy(spec, [Left(), Push()], algorithm=ON, selector=ON, steps=128)
-    with pytest.raises(RunError, match="was declared in Python") as caught:
-        sw.load(plain.train(path.with_name("other"), quiet=True).path)
-    line = f'sw.load("{path.with_name("other")}", hierarchy)'
-    assert str(caught.value).endswith(line)
-    assert sw.load(path.with_name("other"), plain).hierarchy.skills
-
-
-def test_a_hierarchy_of_data_is_loaded_without_its_declaration(path: Path) -> None:
-    plain = Hierarchy("CartPole-v1", [Left()], algorithm=ON, selector=ON, steps=128)
-    run = plain.train(path, quiet=True)
-    found = sw.load(path)
+    data = Hierarchy("CartPole-v1", [Left()], algorithm=ON, selector=ON, steps=128)
+    run = data.train(path.with_name("data"), quiet=True)
+    found = sw.load(run.path)
     assert [skill.name for skill in found.hierarchy.skills] == ["left"]
     assert found.evaluate(2, quiet=True).returns == run.evaluate(2, quiet=True).returns
     with pytest.raises(DeclarationError, match="it must be the Hierarchy or Agent"):
-        sw.load(path, run)  # type: ignore[arg-type]
+        sw.load(run.path, run)  # type: ignore[arg-type]
     with pytest.raises(RunError, match="was trained with the skills"):
-        sw.load(path, declare())
+        sw.load(run.path, declare())
+    code = Hierarchy("CartPole-v1", [Left(), Push()], algorithm=ON, selector=ON, steps=128)
+    other = code.train(path.with_name("other"), quiet=True).path
+    with pytest.raises(RunError, match="was declared in Python") as caught:
+        sw.load(other)
+    assert str(caught.value).endswith(f'sw.load("{other}", hierarchy)')
+    assert sw.load(other, code).hierarchy.skills
 
 
-def test_code_that_a_run_names_is_not_executed(path: Path) -> None:
-    recipe, trap = path.with_name("trap.py"), path.with_name("sprung")
-    recipe.write_text(f"open({str(trap)!r}, 'w')")
-    declared = declare()
-    declared.recipe = str(recipe)
-    declared.train(path, quiet=True)
-    with pytest.raises(RunError, match=r"declared in .*trap\.py, and needs that code"):
-        sw.load(path)
-    assert not trap.exists()
+def test_code_that_a_run_names_is_not_executed(
+    mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text("open('sprung', 'w')")
+    with pytest.raises(RunError, match=r"declared in mine\.py, and needs that code"):
+        sw.load(mine)
+    assert not Path("sprung").exists()
 
 
 # The command line
@@ -595,12 +563,3 @@ def test_the_command_line_begins_continues_and_gives_more_steps(
     shutil.rmtree("run/final")
     assert main([*train, "--set", "steps=512"]) == 1
     assert "skillweave train plain.py --start-from run" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_sac_learns_on(path: Path) -> None:
-    sac = SAC(num_envs=2, batch_size=16, learning_starts=20, network=Network((8,)))
-    for steps in (200, 300):
-        run = sw.train_agent("Pendulum-v1", sac, steps, path, resume=True, quiet=True)
-    assert stages(run)["agent"].continued == [200]
-    assert torch.isfinite(torch.tensor(run.evaluate(1, quiet=True).mean))

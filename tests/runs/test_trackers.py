@@ -38,10 +38,6 @@ def run(tmp_path: Path) -> RunDirectory:
     return RunDirectory.create(tmp_path / "run", small_manifest())
 
 
-def test_no_trackers_are_made_where_none_are_named(run: RunDirectory) -> None:
-    assert make_trackers((), run) == ()
-
-
 def uninstall(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Let a package be missing; what finds packages in truth."""
     real = importlib.util.find_spec
@@ -79,25 +75,14 @@ def test_a_missing_package_is_said_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
-def test_tensorboard_gets_every_scalar_over_environment_steps(run: RunDirectory) -> None:
-    (tracker,) = make_trackers(("tensorboard",), run)
-    tracker.stage("landing", 1000)
-    tracker.tick("landing", 128, 0.5, {"return": 1.5, "kl": 0.25})
-    tracker.tick("landing", 256, 1.0, {"return": 2.5, "kl": 0.5})
-    tracker.done("landing", 256, 1.0, {"return": 2.5})
-    tracker.close()
-    assert list((run.path / "tensorboard/landing").glob("events.out.tfevents.*"))
-    events = events_in(run.path / "tensorboard/landing")
-    assert set(events.Tags()["scalars"]) == {"landing/return", "landing/kl"}
-    points = [(e.step, e.value) for e in events.Scalars("landing/return")]
-    assert points == [(128, 1.5), (256, 2.5)]
-
-
-def test_after_a_resume_tensorboard_shows_each_step_of_each_stage_once(run: RunDirectory) -> None:
+def test_tensorboard_shows_every_scalar_of_each_stage_once_also_after_a_resume(
+    run: RunDirectory,
+) -> None:
     (killed,) = make_trackers(("tensorboard",), run)
+    killed.stage("landing", 1000)
     for steps in (100, 200, 300):  # the latest checkpoint is of step 100
-        killed.tick("landing", steps, 1.0, {"return": 1.0})
-    killed.done("landing", 300, 1.0, {})
+        killed.tick("landing", steps, 1.0, {"return": 1.0, "kl": 0.25})
+    killed.done("landing", 300, 1.0, {"return": 1.0})
     for steps in (100, 200):
         killed.tick("selector", steps, 1.0, {"return": 1.0})
     killed.close()
@@ -105,29 +90,19 @@ def test_after_a_resume_tensorboard_shows_each_step_of_each_stage_once(run: RunD
     for steps in (200, 300):
         resumed.tick("selector", steps, 1.0, {"return": 2.0})
     resumed.close()
+    assert list((run.path / "tensorboard/landing").glob("events.out.tfevents.*"))
     shown = {}
     for stage in ("landing", "selector"):
         events = events_in(run.path / "tensorboard" / stage)
-        shown[stage] = [(e.step, e.value) for e in events.Scalars(f"{stage}/return")]
-    assert shown["landing"] == [(100, 1.0), (200, 1.0), (300, 1.0)]
-    assert shown["selector"] == [(100, 1.0), (200, 2.0), (300, 2.0)]
-
-
-@pytest.mark.slow
-def test_a_resumed_run_goes_on_in_the_same_run_of_wandb(
-    run: RunDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    wandb = pytest.importorskip("wandb")
-    asked: list[dict[str, Any]] = []
-    monkeypatch.setattr(wandb, "run", None)
-    monkeypatch.setattr(wandb, "init", lambda **how: asked.append(how))
-    make_trackers(("wandb",), run)
-    make_trackers(("wandb",), RunDirectory(run.path, run.manifest))
-    content = small_manifest()
-    make_trackers(("wandb",), RunDirectory.create(tmp_path / "other", content))
-    first, again, other = asked
-    assert first["id"] == again["id"] != other["id"]
-    assert first["resume"] == again["resume"] == "allow"
+        shown |= {
+            tag: [(e.step, e.value) for e in events.Scalars(tag)]
+            for tag in events.Tags()["scalars"]
+        }
+    assert shown == {
+        "landing/return": [(100, 1.0), (200, 1.0), (300, 1.0)],
+        "landing/kl": [(100, 0.25), (200, 0.25), (300, 0.25)],
+        "selector/return": [(100, 1.0), (200, 2.0), (300, 2.0)],
+    }
 
 
 class FakeRun:
@@ -182,36 +157,36 @@ def unfinished(run: RunDirectory) -> RunDirectory:
     return run
 
 
-def test_a_run_of_the_programs_own_in_wandb_stays_as_it_is(run: RunDirectory, wandb: Any) -> None:
+def test_a_run_of_the_programs_own_in_wandb_stays_as_it_is(
+    run: RunDirectory, wandb: Any, tmp_path: Path
+) -> None:
     wandb.run = FakeRun(name="mine")
-    for _ in range(2):  # the second time it is resumed
+    others = unfinished(RunDirectory.create(tmp_path / "other", small_manifest()))
+    for one in (unfinished(run), unfinished(run), others):  # the second time it is resumed
         with pytest.warns(UserWarning, match="the W&B run 'mine' is open and stays as it is"):
-            track(unfinished(run))
+            track(one)
     assert not wandb.run.finished
     assert wandb.run.logged == []
-    first, again = wandb.made
-    assert first.how["id"] == again.how["id"]
+    first, again, other = wandb.made
+    assert first.how["id"] == again.how["id"] != other.how["id"]
+    assert first.how["resume"] == again.how["resume"] == "allow"
     assert first.finished
     assert first.logged == [{"landing/return": 1.5, "landing/steps": 128}]
 
 
-def test_a_run_of_a_sweep_gets_the_metrics_and_stays_open(run: RunDirectory, wandb: Any) -> None:
-    wandb.run = FakeRun(name="mine")
-    wandb.run.sweep_id = "s"
-    with pytest.warns(UserWarning, match="go into the W&B run 'mine', which stays open.*a sweep"):
+@pytest.mark.parametrize(
+    ("sweep", "version", "why"),
+    [("s", "0.21.0", ".*a sweep"), (None, "0.19.9", r": wandb before 0\.19\.10")],
+)
+def test_a_run_of_a_sweep_or_of_an_old_wandb_gets_the_metrics_and_stays_open(
+    run: RunDirectory, wandb: Any, sweep: str | None, version: str, why: str
+) -> None:
+    wandb.run, wandb.__version__ = FakeRun(name="mine"), version
+    wandb.run.sweep_id = sweep
+    with pytest.warns(UserWarning, match=f"W&B run 'mine', which stays open{why}"):
         track(unfinished(run))
     assert wandb.made == []
     assert wandb.run.logged == [{"landing/return": 1.5, "landing/steps": 128}]
-    assert not wandb.run.finished
-
-
-def test_an_old_wandb_that_has_one_run_at_a_time_leaves_it_open(
-    run: RunDirectory, wandb: Any
-) -> None:
-    wandb.run, wandb.__version__ = FakeRun(name="mine"), "0.19.9"
-    with pytest.warns(UserWarning, match=r"'mine', which stays open: wandb before 0\.19\.10"):
-        track(unfinished(run))
-    assert len(wandb.run.logged) == 1
     assert not wandb.run.finished
 
 

@@ -52,8 +52,9 @@ def test_a_callback_changes_it(places):
     assert policies(Path("a/run")) == policies(Path("reference"))
 
 
-@pytest.mark.parametrize("where", ["__init__", "reset", "step"])
-@pytest.mark.parametrize("run_dir", ["run", None])
+@pytest.mark.parametrize(
+    ("where", "run_dir"), [("__init__", "run"), ("reset", None), ("step", "run")]
+)
 def test_an_environment_changes_it(places, where, run_dir):
     class Moves(gym.Wrapper):
         pass
@@ -70,8 +71,12 @@ def test_an_environment_changes_it(places, where, run_dir):
 
 def test_loading_resuming_and_more_steps(places):
     agent().train("run", quiet=True)
+    with pytest.raises(RunError, match=r"^run holds a finished run.*train\(\"run\""):
+        agent().train("run", quiet=True)
     loaded = load("run")
     used(places, loaded)
+    with pytest.raises(RunError, match=r"here/run holds a finished run.*\"/.*here/run\""):
+        agent().train(places / "here" / "run", quiet=True)
     os.chdir(places / "here")
 
     def move(event: Any) -> None:
@@ -80,15 +85,6 @@ def test_loading_resuming_and_more_steps(places):
     longer = agent(steps=3 * STEPS).train("run", resume=True, quiet=True, callback=move)
     assert longer.info()["stages"][0]["steps"] == 3 * STEPS
     assert [p.name for p in (places / "there").iterdir()] == ["w.safetensors"]
-
-
-def test_messages_name_the_run_from_where_the_user_is(places):
-    agent().train("run", quiet=True)
-    with pytest.raises(RunError, match=r"^run holds a finished run.*train\(\"run\""):
-        agent().train("run", quiet=True)
-    os.chdir(places / "there")
-    with pytest.raises(RunError, match=r"here/run holds a finished run.*\"/.*here/run\""):
-        agent().train(places / "here" / "run", quiet=True)
 
 
 def test_a_working_directory_that_is_gone(places):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import random
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +74,17 @@ def test_a_callback_gets_each_report_and_each_checkpoint_as_the_run_has_them(tmp
     assert [e.metrics for e in checkpoints] == [e.metrics for e in before]
 
 
-def test_steps_and_progress_count_all_stages(tmp_path):
-    events = []
-    apart().train(tmp_path / "run", quiet=True, callback=events.append)
+@pytest.fixture(scope="module")
+def whole_apart(tmp_path_factory) -> tuple[Path, list[TrainEvent]]:
+    """A run of three stages that nothing stopped, and its events."""
+    events: list[TrainEvent] = []
+    path = tmp_path_factory.mktemp("apart") / "run"
+    apart().train(path, quiet=True, callback=events.append)
+    return path, events
+
+
+def test_steps_and_progress_count_all_stages(whole_apart):
+    events = whole_apart[1]
     assert list(dict.fromkeys(e.stage for e in events)) == ["left", "balance", "selector"]
     total = [e.total_steps for e in events]
     assert total == sorted(total)
@@ -85,7 +94,7 @@ def test_steps_and_progress_count_all_stages(tmp_path):
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("algorithm", [ON, OFF], ids=["ppo", "dqn"])
+@pytest.mark.parametrize("algorithm", [ON, replace(OFF, update_ratio=0.25)], ids=["ppo", "dqn"])
 def test_a_callback_changes_nothing_but_when_it_stops(algorithm, tmp_path):
     answers = itertools.cycle((None, 0, True, ""))  # not False
 
@@ -169,13 +178,18 @@ def test_false_ends_a_population_after_its_generation(workers, kind, tmp_path):
     assert len(run.evaluate(2).returns) == 2
 
 
-@pytest.mark.parametrize("error", [TrialPruned(), ValueError("no"), SkillweaveError("mine")])
-def test_an_exception_passes_through_and_leaves_a_run_to_resume(error, tmp_path):
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """An agent's run that nothing stopped; it is read only."""
+    return agent().train(tmp_path_factory.mktemp("whole") / "run", quiet=True, **EVALUATED).path
+
+
+@pytest.mark.parametrize("error", [TrialPruned(), SkillweaveError("mine")])
+def test_an_exception_passes_through_and_leaves_a_run_to_resume(error, whole, tmp_path):
     def fail(event: TrainEvent):
         if event.steps > 400:
             raise error
 
-    agent().train(tmp_path / "whole", quiet=True, **EVALUATED)
     path = tmp_path / "run"
     with pytest.raises(type(error)) as caught:
         agent().train(path, quiet=True, callback=fail, **EVALUATED)
@@ -187,15 +201,14 @@ def test_an_exception_passes_through_and_leaves_a_run_to_resume(error, tmp_path)
     assert f'agent.train("{path}", resume=True, callback=callback)' in note
     error.__notes__.clear()
     agent().resume(path, quiet=True)
-    assert_same(path, tmp_path / "whole")
+    assert_same(path, whole)
 
 
-def test_an_exception_in_the_first_report_of_a_later_stage(tmp_path):
+def test_an_exception_in_the_first_report_of_a_later_stage(whole_apart, tmp_path):
     def fail(event: TrainEvent):
         if event.stage == "selector":
             raise TrialPruned
 
-    apart().train(tmp_path / "whole", quiet=True)
     with pytest.raises(TrialPruned) as caught:
         apart().train(tmp_path / "run", quiet=True, callback=fail)
     assert "saved after balance" in caught.value.__notes__[0]
@@ -203,7 +216,7 @@ def test_an_exception_in_the_first_report_of_a_later_stage(tmp_path):
     apart().resume(tmp_path / "run", quiet=True, callback=events.append)
     assert {e.stage for e in events} == {"selector"}
     assert events[0].total_steps == 640 + events[0].steps
-    assert_same(tmp_path / "run", tmp_path / "whole")
+    assert_same(tmp_path / "run", whole_apart[0])
 
 
 def test_a_keyboard_interrupt_of_a_callback_is_one(tmp_path):
@@ -239,13 +252,12 @@ def generator(event: TrainEvent):
         (lambda a, b: None, r"callback takes \(a, b\), but it is called with one event"),
     ],
 )
-def test_what_is_no_callback_is_refused_before_anything_is_written(callback, says, tmp_path):
+def test_what_is_no_callback_is_refused_before_anything_is_written(callback, says, whole, tmp_path):
     with pytest.raises(DeclarationError, match=says):
         agent().train(tmp_path / "run", callback=callback)
     assert not (tmp_path / "run").exists()
-    agent(64).train(tmp_path / "other", quiet=True)
     with pytest.raises(SkillweaveError, match=says):
-        agent(64).resume(tmp_path / "other", callback=callback)
+        agent().resume(whole, callback=callback)
 
 
 def test_functions_written_in_c_and_partial_ones_are_callbacks(tmp_path):

@@ -32,21 +32,15 @@ def told(name: str, experience: Batch) -> dict[str, float]:
     return {k: float(v) for k, v in how_it_acted(name, experience).items()}
 
 
-def test_of_a_skill_how_much_it_acted_and_its_own_reward_there():
-    valid = np.array([[True, False], [False, True], [False, False]])
+def test_what_is_told_of_skills_selectors_and_critics():
+    valid, never = np.array([[True, False], [False, True], [False, False]]), np.zeros((3, 2), bool)
     assert told("inner/left", rows(valid)) == {"usage": np.float32(2 / 6), "reward": 1.5}
-    assert told("left", rows(np.zeros((3, 2), bool))) == {"usage": 0.0}
-
-
-def test_of_a_selector_how_long_its_calls_were():
+    assert told("left", rows(never)) == {"usage": 0.0}
     steps = np.array([[1, 5], [9, 9], [9, 9]])
-    valid = np.array([[True, True], [False, False], [False, False]])
-    assert told("selector", rows(valid, steps)) == {"call_length": 3.0}
+    first = np.array([[True, True], [False, False], [False, False]])
+    assert told("selector", rows(first, steps)) == {"call_length": 3.0}
     assert told("inner/selector", rows(None, steps)) == {"call_length": 7.0}
-    assert told("selector", rows(np.zeros((3, 2), bool), steps)) == {}
-
-
-def test_of_a_critic_nothing():
+    assert told("selector", rows(never, steps)) == {}
     assert told("skill_critic", rows()) == {}
 
 

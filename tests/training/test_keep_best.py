@@ -46,6 +46,7 @@ from skillweave.training.keep_best import KeepBest
 SYNC = EnvSpec("CartPole-v1", engine="sync", workers=1)
 WILD = replace(ON, learning_rate=0.05)
 """So that the last weights are seldom the best."""
+REPLAY = replace(OFF, update_ratio=0.25)
 BEST = {
     "eval_every": 100,
     "eval_episodes": 3,
@@ -81,9 +82,9 @@ def evaluations(path: Path, stage: str) -> dict[int, float]:
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("algorithm", [WILD, replace(OFF, overlap=True)], ids=["ppo", "dqn"])
+@pytest.mark.parametrize("algorithm", [WILD, replace(REPLAY, overlap=True)], ids=["ppo", "dqn"])
 def test_a_stage_ends_with_the_weights_of_its_best_evaluation(algorithm, tmp_path):
-    budget = 960 if algorithm is WILD else 6_000
+    budget = 960 if algorithm is WILD else 2_400
     how = BEST | {"eval_every": budget // 6}
     run = agent(budget, algorithm).train(tmp_path / "best", **how)
     (entry,) = run.info()["stages"]
@@ -109,7 +110,7 @@ def test_the_last_weights_are_evaluated_too(tmp_path):
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("learn", ["together", "apart", "apart, then together"])
+@pytest.mark.parametrize("learn", ["together", "apart, then together"])
 def test_every_stage_keeps_its_best_and_says_so(learn, tmp_path, monkeypatch):
     judged = []
     scores = select_best._scores
@@ -134,16 +135,14 @@ def test_every_stage_keeps_its_best_and_says_so(learn, tmp_path, monkeypatch):
         for name, policy in judged_run.load_policies("together").items():
             for key, weight in policy.weights.items():
                 assert torch.equal(after[name].weights[key], weight)
-    assert bool(judged) == (learn != "apart")
+    assert judged
 
 
 KINDS = {
     "ppo": agent,
     "without overlap": lambda: agent(960, replace(WILD, overlap=False)),
-    "dqn": lambda: agent(1_500, replace(OFF, overlap=True)),
-    "apart": lambda: hierarchy("apart"),
-    "together": lambda: hierarchy("together"),
-    "together, from replay": lambda: hierarchy("together", OFF),
+    "dqn": lambda: agent(1_500, replace(REPLAY, overlap=True)),
+    "together, from replay": lambda: hierarchy("together", REPLAY),
     "apart, then together": lambda: hierarchy("apart, then together"),
 }
 
@@ -155,7 +154,7 @@ def test_a_resumed_run_keeps_the_same(kind, tmp_path, monkeypatch):
     stops = 0
     while True:
         with monkeypatch.context() as patch:
-            interrupt_at_checkpoint(patch, 2)
+            interrupt_at_checkpoint(patch, 3 if kind == "apart, then together" else 2)
             try:
                 if (tmp_path / "run").exists():
                     KINDS[kind]().resume(tmp_path / "run", quiet=True)
@@ -198,7 +197,7 @@ class Long(gym.Wrapper):
         return obs, reward, terminated, truncated, info | {"success": self.steps >= 14}
 
 
-def test_the_target_of_the_stage_decides_what_is_best(tmp_path):
+def test_the_target_of_the_stage_decides_what_is_best_and_is_so_where_it_is_reached(tmp_path):
     run = train_agent(
         EnvSpec(lambda: Long(gym.make("CartPole-v1")), workers=1), WILD, 640, tmp_path / "run",
         target_success=1.0, **BEST | {"eval_episodes": 5},
@@ -207,10 +206,7 @@ def test_the_target_of_the_stage_decides_what_is_best(tmp_path):
     assert entry["best"]["of"] == "success"
     shares = [x["eval_success"] for x in lines(run.path) if "eval_success" in x]
     assert entry["best"]["value"] == max(shares)
-
-
-def test_a_target_that_is_reached_is_the_best(tmp_path):
-    run = train_agent(SYNC, ON, 3_000, tmp_path / "run", target_return=9.0, **BEST)
+    run = train_agent(SYNC, ON, 3_000, tmp_path / "reached", target_return=9.0, **BEST)
     (entry,) = run.info()["stages"]
     assert entry["reached"]["value"] == entry["best"]["value"]
 
@@ -261,12 +257,6 @@ def test_keep_without_evaluations_is_refused_before_training(flat, tmp_path):
     with pytest.raises(SkillweaveError, match=says):
         agent().train(tmp_path / "run", keep="best")
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("keep", ["bst", True, 3])
-def test_a_wrong_keep_is_refused(keep, tmp_path):
-    with pytest.raises(SkillweaveError, match=r"^keep is .*; it must be one of last, best"):
-        agent().train(tmp_path / "run", keep=keep)
 
 
 def test_a_recipe_may_say_what_is_kept(tmp_path):

@@ -230,23 +230,22 @@ def test_environments_in_a_pool(tmp_path):
 
 
 REFUSED = [
-    ({"log_calls": 0}, "log_calls is 0"),
-    ({"log_calls": 10**10}, "at most 4 GiB are recorded"),
-    ({"log_calls_info": ["lean"]}, "set log_calls, too"),
-    ({"log_calls": 50, "log_calls_info": "lean"}, "log_calls_info is 'lean'"),
-    ({"log_calls": 50, "flat": True}, "flat trains one plain agent"),
-    ({"log_calls": 50, "evolve": Evolution(population=2, generations=2)}, "of a population"),
+    ({}, {"log_calls": 0}, "log_calls is 0"),
+    ({}, {"log_calls": 10**10}, "at most 4 GiB are recorded"),
+    ({}, {"log_calls_info": ["lean"]}, "set log_calls, too"),
+    ({}, {"log_calls": 50, "log_calls_info": "lean"}, "log_calls_info is 'lean'"),
+    ({}, {"log_calls": 50, "flat": True}, "flat trains one plain agent"),
+    ({}, {"log_calls": 50, "evolve": Evolution(population=2, generations=2)}, "of a population"),
+    (
+        {"selector": lambda obs: np.full(len(obs), "left")},
+        {"log_calls": 50},
+        "no selector acts while this hierarchy trains",
+    ),
 ]
 
 
-@pytest.mark.parametrize(("how", "message"), REFUSED)
-def test_what_cannot_be_logged_is_refused(how, message, tmp_path):
+@pytest.mark.parametrize(("declared", "how", "message"), REFUSED)
+def test_what_cannot_be_logged_is_refused(declared, how, message, tmp_path):
     with pytest.raises(DeclarationError, match=message):
-        declare().train(tmp_path / "run", quiet=True, **how)
+        declare(**declared).train(tmp_path / "run", quiet=True, **how)
     assert not (tmp_path / "run").exists()
-
-
-def test_skills_that_learn_apart_below_a_ready_selector_are_not_called(tmp_path):
-    declared = declare(selector=lambda obs: np.full(len(obs), "left"))
-    with pytest.raises(DeclarationError, match="no selector acts while this hierarchy trains"):
-        declared.train(tmp_path / "run", quiet=True, log_calls=50)

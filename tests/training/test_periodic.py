@@ -6,26 +6,17 @@ import itertools
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
-import torch
 from toys import Calls, Clockwork, Countdown, Echo, Toy
 
 from skillweave import (
-    DQN,
     PPO,
-    Apart,
-    Hierarchy,
     Network,
-    Skill,
-    TrainDefaults,
 )
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.envs import checked
 from skillweave.experience.collector import RETURN
 from skillweave.experience.learners import Alone
-from skillweave.runs.directory import RunDirectory
-from skillweave.runs.files import read_tensors
 from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 
 SMALL = Network((8,), "relu")
@@ -104,39 +95,3 @@ def test_an_evaluation_is_made_once_in_every_so_many_steps():
     assert (evaluation.spent(), evaluation.spent()) == (15, 0)
     never = PeriodicEvaluation(learning_task, Seeds(0), None, 3, 8)
     assert never.due(0, 10**6, play) == {}
-
-
-class Balance(Skill):
-    """Stay up."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "algorithm",
-    [PPO(num_envs=4, n_steps=16, batch_size=32, network=SMALL),
-     DQN(num_envs=4, learning_starts=100, batch_size=8, network=SMALL)],
-)  # fmt: skip
-def test_a_run_is_evaluated_at_every_level_and_that_changes_nothing(tmp_path, algorithm):
-    weights = []
-    for every in (1000, None):
-        hierarchy = Hierarchy(
-            "CartPole-v1",
-            [Balance()],
-            algorithm=algorithm,
-            selector=algorithm,
-            call_steps=5,
-            apart=Apart(skill_steps=2200, selector_steps=2200),
-            train_defaults=TrainDefaults(eval_every=every, eval_episodes=3),
-            learn="apart",
-        )
-        run = hierarchy.train(tmp_path / str(every), quiet=True)
-        lines = list(RunDirectory.open(run.path).metrics())
-        for stage in ("balance", "selector"):
-            seen = [m["steps"] // 1000 for m in lines if m["stage"] == stage and "eval_return" in m]
-            assert seen == ([1, 2] if every else [])
-            assert all(
-                m["eval_return"] >= m["eval_return_min"] > 0 for m in lines if "eval_return" in m
-            )
-        weights.append(read_tensors(run.path / "policies" / "selector.safetensors")[0])
-    assert weights[0].keys() == weights[1].keys()
-    assert all(torch.equal(v, weights[1][k]) for k, v in weights[0].items())

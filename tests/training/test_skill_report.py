@@ -234,7 +234,7 @@ class Nod(AtOnce):
     success = Skill.success
 
 
-def test_a_termination_that_is_always_true_is_told():
+def test_a_termination_that_is_always_true_is_told_and_moves_of_one_step_are_right():
     found = told(by_turns, AtOnce, Left)[1]
     calls = found.skills["at_once"].calls
     sentence = (
@@ -243,12 +243,9 @@ def test_a_termination_that_is_always_true_is_told():
     )
     assert sentence in found.for_people().splitlines()
     assert useless_skills(found.skills, 20, selector_learns=True)[0] == sentence
-
-
-@pytest.mark.parametrize("kind", [Move, Nod, Far])
-def test_moves_of_one_step_are_right(kind):
-    found = told(by_turns, kind, Left)[1]
-    assert "ended after one step: its termination" not in found.for_people()
+    for kind in (Move, Nod, Far):
+        right = told(by_turns, kind, Left)[1]
+        assert "ended after one step: its termination" not in right.for_people()
 
 
 def test_episodes_in_which_a_skill_never_began_are_counted():
@@ -484,11 +481,6 @@ def test_calls_below_a_skill_alone_count_from_where_it_may_start():
         assert sum(own.ended.values()) == own.calls
 
 
-def test_where_no_reward_is_defined_it_is_the_environments():
-    found = evaluate(woven(Zigzag), EnvSpec(Walk), episodes=9)
-    assert found.skills["zigzag"].return_sum == pytest.approx(sum(found.returns))
-
-
 class Labelled(ScriptedPolicy):
     """Names skills, but has no declarations of them."""
 
@@ -512,15 +504,12 @@ def test_of_a_policy_that_is_no_hierarchy_only_steps_and_calls_are_known():
     assert found.skills == {"low": SkillReport(0, 0, {}, None, None), "high": high}
     assert (high.success_rate, high.return_mean) == (None, None)
     assert " - " in found.for_people()
-
-
-def test_a_plain_policy_has_no_table():
-    found = evaluate(scripted(1), EnvSpec(Walk), episodes=3)
-    told = found.to_json()
-    assert (found.skills, found.skill_steps, found.skill_calls) == ({}, {}, {})
+    plain = evaluate(scripted(1), EnvSpec(Walk), episodes=3)
+    told = plain.to_json()
+    assert (plain.skills, plain.skill_steps, plain.skill_calls) == ({}, {}, {})
     assert (told["skills"], told["skill_usage"]) == ({}, {})
-    assert found.for_people() == str(found)
-    assert "skills" not in str(found)
+    assert plain.for_people() == str(plain)
+    assert "skills" not in str(plain)
 
 
 class Fleeing(Skill):
