@@ -34,7 +34,7 @@ from skillweave.errors import KINDS, SkillError, SkillweaveError
 from skillweave.networks.encoders import CellsEncoder
 from skillweave.policies.sessions import open_session
 from skillweave.skills.selector import FunctionSelector
-from skillweave.spaces import obs_codec
+from skillweave.spaces import action_codec, obs_codec
 from skillweave.workers.shipping import packed
 
 SMALL = sw.PPO(num_envs=4, n_steps=32, batch_size=32)
@@ -835,6 +835,35 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ("DeclarationError", lambda: bound(sw.tree.Sequence(ended)), "tree has no skill"),
     ("DeclarationError", lambda: sw.tree.Condition("a"), "Condition is 'a'"),
     ("DeclarationError", lambda: bound(sw.tree.Sequence("fly")), "leaf names 'fly'"),
+    # Names of arguments and attributes
+    ("DeclarationError", lambda: sw.PPO(lr=1), "no setting 'lr': is 'learning_rate' meant"),
+    ("DeclarationError", lambda: sw.PPO(Gamma=1), "is 'gamma' meant"),
+    ("DeclarationError", lambda: sw.PPO(hidden=(8,)), "write network=Network(hidden=...)"),
+    ("DeclarationError", lambda: sw.Network(zzzz=1), "there are: hidden, activation, layer_norm,"),
+    ("DeclarationError", lambda: sw.DQN.rainbow(doble=True), "DQN has no setting 'doble'"),
+    ("DeclarationError", lambda: dataclasses.replace(sw.SAC(), tua=1), "is 'tau' meant"),
+    ("DeclarationError", lambda: setattr(sw.PPO(), "gama", 0.9), "is 'gamma' meant"),
+    ("DeclarationError", lambda: sw.Reflex(print, acton=1), "no argument 'acton': is 'action'"),
+    ("DeclarationError", lambda: sw.Reflex(print), "write Reflex(condition, action)"),
+    ("DeclarationError", lambda: sw.tree.Sequence("a", memry=True), "is 'memory' meant"),
+    ("DeclarationError", lambda: sw.evaluate(), "write evaluate(policy, env)"),
+    ("DeclarationError", lambda: sw.envs.envpool("X"), "needs num_envs and threads and seed"),
+    ("DeclarationError", lambda: declare(rnn=1), "algorithm=PPO(network=Network(rnn=...))"),
+    ("DeclarationError", lambda: declare().train(gamma=1.0), "Hierarchy(algorithm=PPO(gamma="),
+    ("DeclarationError", lambda: declare().load(verbose_=1), "there are: run_dir"),
+    ("DeclarationError", lambda: sw.Hierarchy(), "write Hierarchy(env, skills)"),
+    ("DeclarationError", lambda: sw.Hierarchy("CartPole-v1"), "Hierarchy needs skills: write"),
+    ("DeclarationError", lambda: declare().load(), "needs run_dir: write load(run_dir)"),
+    ("DeclarationError", lambda: sw.Hierarchy("X", [Good()], env="X"), "was given env twice"),
+    ("DeclarationError", lambda: declare().load("x", "y"), "takes at most 1 of its arguments"),
+    ("DeclarationError", lambda: setattr(declare(), "spec", 5), "spec is computed; it cannot be"),
+    # An OptionsEnv
+    (
+        "DeclarationError",
+        lambda: sw.envs.make_options_env(declare(), 2, 0.9),
+        "skill 'good' has no policy",
+    ),
+    ("DeclarationError", lambda: sw.envs.make_options_env(declare(), 2, 2), "gamma is 2"),
     # One argument alone
     (
         "DeclarationError",
@@ -866,6 +895,11 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
         "fails on observations",
     ),
     ("EnvError", lambda: obs_codec(gym.spaces.Box(0, 1, (0,))), "holds no number"),
+    ("EnvError", lambda: obs_codec(gym.spaces.Text(3)), "Box, Discrete, MultiDiscrete, MultiB"),
+    ("EnvError", lambda: obs_codec(gym.spaces.Tuple((gym.spaces.Text(3),))), "Box, Discrete"),
+    ("EnvError", lambda: obs_codec(gym.spaces.Tuple(())), "at least one part, each with text"),
+    ("EnvError", lambda: obs_codec(gym.spaces.Dict([(1, BYTES)])), "each with text as its name"),
+    ("EnvError", lambda: action_codec(gym.spaces.Text(2)), "MultiBinary, Box, and Dict and Tuple"),
     (
         "DeclarationError",
         lambda: packed({"a": threading.Lock()}, "the arm"),
