@@ -138,8 +138,11 @@ def test_the_setting_counts_for_the_images_of_which_it_is_not_known(read):
     assert {k: part.shape for k, part in asked.items()} == {"board": (5, 6, 7), "camera": (3, 9, 9)}
 
 
+LAST = sw.Network((4,), planes="last")
+
+
 class Win(sw.Skill):
-    algorithm = sw.PPO(num_envs=2, n_steps=8, network=sw.Network((4,), planes="last"))
+    algorithm = sw.PPO(num_envs=2, n_steps=8, network=LAST, critic=LAST)
 
 
 def test_a_selector_is_refused_before_its_skills_are_trained(tmp_path):
@@ -163,24 +166,6 @@ def test_the_critic_of_skills_reads_boards_as_the_selector_does(tmp_path, select
     )
     run = declared.train(tmp_path / "run", quiet=True)
     assert run.evaluate(2, quiet=True).mean == 5
-
-
-def test_a_critic_of_its_own_reads_boards_as_the_actor_does():
-    sw.PPO(network=sw.Network(planes="last"), critic=sw.Network(planes="last"))
-    sw.PPO(network=sw.Network(planes="last"), critic=sw.Network())
-    with pytest.raises(DeclarationError, match="planes of network counts for both"):
-        sw.PPO(critic=sw.Network(planes="first"))
-
-
-def test_a_run_remembers_the_setting(tmp_path):
-    def make():
-        return Shows(Box(0, 3, (5, 6, 7), BYTES))
-
-    run = sw.train_agent(make, settings(planes="last"), 16, tmp_path / "run", quiet=True)
-    manifest = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert manifest["stages"][0]["algorithm"]["network"]["planes"] == "last"
-    again = sw.Agent(make, settings(planes="last"), 16).load(tmp_path / "run")
-    assert again.evaluate(3, quiet=True).returns == run.evaluate(3, quiet=True).returns
 
 
 @pytest.mark.parametrize("side", [1, 2, 3, 5])
@@ -246,6 +231,10 @@ def test_the_command_line_sets_it(tmp_path, capsys):
     assert main([*train, *(word.format("middle") for word in both)]) == 1
     assert "expected one of first, last, None" in capsys.readouterr().err
     assert main([*train, *(word.format("last") for word in both)]) == 0
+    (stage,) = json.loads((tmp_path / "run" / "run.json").read_text())["stages"]
+    assert stage["algorithm"]["network"]["planes"] == "last"
+    again = ["evaluate", str(tmp_path / "run"), "--recipe", str(recipe), "--episodes", "2"]
+    assert main(again) == 0
 
 
 @pytest.mark.slow
