@@ -156,7 +156,8 @@ def test_the_command_line_has_both_scores(tmp_path, capsys):
         'hierarchy = sw.Hierarchy("CartPole-v1", [Up()], algorithm=settings, selector=settings, '
         "steps=32)\n"
     )
-    assert main(["train", str(recipe), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    train = ["train", str(recipe), "--out", str(tmp_path / "run"), "--quiet", "--evaluate", "0"]
+    assert main(train) == 0
     ask = ["evaluate", str(tmp_path / "run"), "--recipe", str(recipe), "--episodes", "3"]
     capsys.readouterr()
     assert main([*ask, "--skill", "up"]) == 0
