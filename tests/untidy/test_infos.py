@@ -267,14 +267,9 @@ def test_a_success_may_be_given_in_some_steps_alone(way):
             obs, *_ = super().step(action)
             over = self.t == self.length
             wins = over and self.length > 5
-            late = {"success": wins if over else None}
-            return (
-                obs,
-                1.0,
-                over,
-                False,
-                late if way != "only where it is true" else ({"success": True} if wins else {}),
-            )
+            if way == "only where it is true":
+                return obs, 1.0, over, False, {"success": True} if wins else {}
+            return obs, 1.0, over, False, {"success": wins if over else None}
 
     policy = sw.from_function(lambda obs: np.zeros(len(obs), int))
     for num_envs in (1, 3, 20):
