@@ -1,12 +1,14 @@
-"""Keyword arguments of ``Hierarchy`` for tests that vary single settings of any group."""
+"""Small hierarchies, declared by bare names of settings of any group."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from small_runs import OFF, ON, Balance, Left, Push
+
 from benchmarks.grouped import grouped
-from skillweave import Guide, Hierarchy, Together
+from skillweave import EnvSpec, Guide, Hierarchy, Skill, Together
 from skillweave.hierarchy.roles import roles_of
 from skillweave.skills.skill_set import SkillSet
 
@@ -31,3 +33,26 @@ def skills_with(declared: Hierarchy, policies: Sequence[Any]) -> SkillSet:
     """Return all skills of a hierarchy with these policies, in their order."""
     level = roles_of(declared).outermost
     return level.skill_set(dict(zip(level.skills, policies, strict=True)))
+
+
+def declare(*skills: Skill | Hierarchy, workers: int | None = 1, **how: Any) -> Hierarchy:
+    """Declare skills that learn together on CartPole, unless ``how`` says otherwise."""
+    options = {
+        "env": EnvSpec("CartPole-v1", engine="sync", workers=workers),
+        "skills": skills or [Left(), Balance(), Push()],
+        "call_steps": 6,
+        "algorithm": ON,
+        "selector": ON,
+        "learn": "together",
+        "together_steps": 450,
+        "skill_steps": 150,
+        "selector_steps": 150,
+        "checkpoint_every": 75,
+    }
+    return Hierarchy(**plainly(options | how))
+
+
+class Other(Balance):
+    """Learns from replay."""
+
+    algorithm = OFF

@@ -1,4 +1,4 @@
-"""Hostile skills, environments, reflexes, policies and settings, drawn by Hypothesis.
+"""Hostile skills, environments, reflexes, policies and calls, drawn by Hypothesis.
 
 Each is tried out as a user would: declare, train a few steps, evaluate. It must be told in a
 sentence (a SkillweaveError) that names who, or do no harm. ``run_hostile`` counts what happened.
@@ -15,24 +15,20 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from declaring import plainly
+from declaring import declare as small
 from hypothesis import HealthCheck, Phase, given, seed, settings, strategies as st
 
-from skillweave import DQN, PPO, SAC, TD3, EnvSpec, Hierarchy, Network, Reflex, Skill
-from skillweave.algorithms import CNN, RNN
+from skillweave import PPO, EnvSpec, Hierarchy, Network, Reflex, Skill
 from skillweave.errors import SkillweaveError
 
 TINY = Network((4,))
 PPO_TINY = PPO(num_envs=2, n_steps=4, batch_size=8, update_epochs=1, network=TINY)
-OFF: dict[str, Any] = {
-    "num_envs": 2, "buffer_size": 64, "learning_starts": 4, "batch_size": 4, "network": TINY,
-}  # fmt: skip
 STEPS = 16
 
 
@@ -77,10 +73,10 @@ class Slope(Ramp):
 def declare(env: Any = Ramp, **declared: Any) -> Hierarchy:
     """A hierarchy of one plain skill that trains for a few steps."""
     how: dict[str, Any] = {
-        "skills": [Plain()], "algorithm": PPO_TINY, "selector": PPO_TINY, "skill_steps": STEPS,
-        "selector_steps": STEPS, "call_steps": 2,
+        "env": env, "skills": [Plain()], "algorithm": PPO_TINY, "selector": PPO_TINY,
+        "learn": "apart", "skill_steps": STEPS, "selector_steps": STEPS, "call_steps": 2,
     }  # fmt: skip
-    return Hierarchy(env, **plainly(how | declared))
+    return small(**how | declared)
 
 
 def train(folder: Path, env: Any = Ramp, **declared: Any) -> None:
@@ -368,11 +364,7 @@ def maker_cases(draw: Any) -> Case:
     return Case("maker", label, (), lambda folder: train(folder, value))
 
 
-# Settings --------------------------------------------------------------------------------------
-
-KINDS = (PPO_TINY, Ramp), (DQN(**OFF), Ramp), (SAC(**OFF), Slope), (TD3(**OFF), Slope)
-SLOW = {"threads", "compile", "update_epochs", "train_freq", "update_ratio", "policy_delay"}
-"""Settings whose large values are right, and take for ever."""
+# Calls -----------------------------------------------------------------------------------------
 
 
 def _values(slow: bool = False) -> st.SearchStrategy[Any]:
@@ -381,81 +373,9 @@ def _values(slow: bool = False) -> st.SearchStrategy[Any]:
     return st.one_of(small, small, _anything().filter(lambda v: not slow or v != 10**400), large)
 
 
-@st.composite
-def setting_cases(draw: Any) -> Case:
-    """One setting of an algorithm or a network that is odd."""
-    if draw(st.integers(0, 3)) == 0:
-        kind: Any = draw(st.sampled_from((Network, CNN, RNN)))
-        field = draw(st.sampled_from([f.name for f in fields(kind)]))
-        value = draw(
-            st.one_of(_values(), _values().map(lambda v: (v,)), _values().map(lambda v: (4, v)))
-        )
-
-        def play(folder: Path) -> None:
-            made = kind(**{field: value})
-            if kind is not Network:
-                made = Network((4,), **{kind.__name__.lower(): made})
-            train(folder, algorithm=replace(PPO_TINY, network=made))
-
-        return Case("network", f"{kind.__name__}.{field} {_const(value).__name__}", (field,), play)
-    usual, env = draw(st.sampled_from(KINDS))
-    field = draw(st.sampled_from([f.name for f in fields(usual) if f.name != "compile"]))
-    value = draw(_values(field in SLOW))
-    label = f"{type(usual).__name__}.{field} {_const(value).__name__}"
-
-    def train_with(folder: Path) -> None:
-        train(folder, env, algorithm=replace(usual, **{field: value}))
-
-    return Case("setting", label, (field,), train_with)
-
-
-DECLARED = (
-    "skills",
-    "call_steps",
-    "reflexes",
-    "algorithm",
-    "selector",
-    "skill_steps",
-    "selector_steps",
-    "start_calls",
-    "search_steps",
-    "episode_calls",
-    "deliberation_cost",
-    "greedy_skills",
-    "greedy_selector",
-    "target_return",
-    "checkpoint_every",
-    "eval_every",
-    "eval_episodes",
-)
-ATTRIBUTES = (
-    "name", "max_steps", "steps", "algorithm", "policy", "color", "reward", "termination",
-    "target_return", "target_success",
-)  # fmt: skip
-
-
 def _few(value: Any) -> bool:
     """Whether a number is no budget that would take for ever."""
     return not isinstance(value, int) or value < 1000
-
-
-@st.composite
-def declared_cases(draw: Any) -> Case:
-    """One field of a hierarchy, or of a skill, that is odd."""
-    value = draw(_values(True).filter(_few))
-    label = _const(value).__name__
-    if draw(st.booleans()):
-        field = draw(st.sampled_from(DECLARED))
-        declared = {"eval_every": STEPS, "eval_episodes": 1, field: value}
-        return Case(
-            "declaration", f"{field} {label}", (field.rstrip("s"),),
-            lambda folder: train(folder, **declared),
-        )  # fmt: skip
-    field = draw(st.sampled_from(ATTRIBUTES))
-    kind = type("Hostile", (Skill,), {field: value})
-    return Case(
-        "attribute", f"{field} {label}", (field,), lambda folder: train(folder, skills=[kind()])
-    )
 
 
 @functools.cache
@@ -505,8 +425,7 @@ def cases() -> st.SearchStrategy[Case]:
     """Any of them."""
     return st.one_of(
         skill_cases(), skill_cases(), environment_cases(), environment_cases(), space_cases(),
-        maker_cases(), reflex_cases(), policy_cases(), setting_cases(), setting_cases(),
-        declared_cases(), call_cases(),
+        maker_cases(), reflex_cases(), policy_cases(), call_cases(),
     )  # fmt: skip
 
 

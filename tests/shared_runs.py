@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from declaring import plainly
+from declaring import declare as small
 
 import skillweave as sw
 
@@ -29,11 +28,8 @@ class Right(sw.Skill):
 
 
 def declare(*skills: sw.Skill) -> sw.Hierarchy:
-    env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
-    how: dict[str, Any] = {"call_steps": 5, "algorithm": SMALL, "selector": SMALL}
-    return sw.Hierarchy(
-        env, skills, apart=sw.Apart(skill_steps=100, selector_steps=100), **plainly(how)
-    )
+    how = {"learn": "apart", "skill_steps": 100, "selector_steps": 100, "checkpoint_every": 10**5}
+    return small(*skills, call_steps=5, algorithm=SMALL, selector=SMALL, **how)
 
 
 def files_of(path: Path) -> dict[str, bytes]:

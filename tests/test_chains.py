@@ -8,9 +8,9 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
+from declaring import declare
 from ready_selectors.chain import DOOR, KEY, SPEC, GetKey, Leave, got_key
 from small_runs import ON, Heard, assert_same, messages, new_run, stopped_run
-from together_runs import declare
 
 from skillweave import Automaton, SkillweaveError, Together
 from skillweave.envs.make import EnvSpec

@@ -4,9 +4,10 @@ import functools
 import shutil
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
+from toys import World
 
 import skillweave as sw
 from scripts.torture import kinds as torture
@@ -125,42 +126,23 @@ def test_an_undamaged_run_is_resumed(made, tmp_path, kind):
 # A checkpoint that is whole, and does not fit the program any more
 
 
-class Changing(gym.Env):
-    """Walks on a line; what it shows is given."""
-
-    action_space = gym.spaces.Discrete(2)
-
-    def __init__(self, size=2, dtype=np.float32):
-        self.observation_space = gym.spaces.Box(-9, 9, (size,), dtype)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self.seen(), {}
-
-    def step(self, action):
-        self.t += 1
-        return self.seen(), float(action), False, self.t == 20, {}
-
-    def seen(self):
-        return np.full(self.observation_space.shape, self.t / 20, self.observation_space.dtype)
-
-
 REPLAY = sw.DQN(**REPLAYS)
+SHOWN = Box(-9, 9, (2,), np.float32)
+WIDER, DOUBLES = Box(-9, 9, (3,), np.float32), Box(-9, 9, (2,), np.float64)
 
 
 @pytest.mark.parametrize(
     ("algorithm", "change", "says"),
     [
-        (ROLLOUTS, {"size": 3}, r"agent: tensor params should be"),
-        (REPLAY, {"dtype": np.float64}, r"stage 'agent': .*replay buffer does not fit: 'obs'"),
+        (ROLLOUTS, WIDER, r"agent: tensor params should be"),
+        (REPLAY, DOUBLES, r"stage 'agent': .*replay buffer does not fit: 'obs'"),
     ],
     ids=["another size", "another type, replay"],
 )
 def test_what_a_changed_environment_does_not_fit_is_named(tmp_path, algorithm, change, says):
-    def of(env):
-        return Kind(lambda: alone(functools.partial(Changing, **env), algorithm, 400))
+    def of(space):
+        return Kind(lambda: alone(functools.partial(World, space), algorithm, 400))
 
-    unfinished(of({}), 2)(tmp_path)
+    unfinished(of(SHOWN), 2)(tmp_path)
     with pytest.raises(sw.SkillweaveError, match=says):
         of(change).declare().resume(tmp_path / "run", quiet=True)

@@ -38,15 +38,12 @@ def plain_errors(source: str) -> Iterator[str]:
             yield f"line {node.lineno}: class {node.name}"
 
 
-def test_the_search_finds_errors_without_a_kind():
+def test_no_place_raises_an_error_without_a_kind():
     source = "raise SkillweaveError('x')\nx = sw.SkillweaveError('y')\nraise SkillweaveError\n"
     assert len(set(plain_errors(source))) == 3
     assert list(plain_errors("class A(SkillweaveError): ...")) == ["line 1: class A"]
     allowed = "try:\n    f()\nexcept SkillweaveError:\n    raise RunError('x') from None\n"
     assert list(plain_errors(allowed)) == []
-
-
-def test_no_place_raises_an_error_without_a_kind():
     found = {
         str(path.relative_to(ROOT)): lines
         for path in ROOT.rglob("*.py")

@@ -113,18 +113,17 @@ def test_an_example_runs_to_its_end(path, tmp_path):
     assert "Traceback" not in done.stderr
 
 
-def adapter():
+def test_stable_baselines3_is_told_final_observations_time_limits_and_environment_steps():
     pytest.importorskip("stable_baselines3")
-    return example("sb3_selector")
-
-
-def test_stable_baselines3_is_told_final_observations_and_time_limits():
     from skillweave import EnvSpec
     from skillweave.envs import OptionsEnv
     from skillweave.envs.make import make_engine
     from skillweave.skills.skill_set import SkillSet
 
-    module = adapter()
+    module = example("sb3_selector")
+    budget = module.StepBudget(25)
+    budget.locals = {"infos": [{"steps": 10}, {"steps": 2}]}
+    assert [budget._on_step(), budget._on_step(), budget._on_step()] == [True, True, False]
     skills = (module.DriftLeft(), module.DriftRight())
     policies = tuple(s.policy for s in skills)
     spec = EnvSpec("CartPole-v1", kwargs={"max_episode_steps": 47}, engine="sync")
@@ -157,13 +156,6 @@ def test_stable_baselines3_is_told_final_observations_and_time_limits():
     theirs.close()
     ours.close()
     assert limits > 5
-
-
-def test_stable_baselines3s_own_checker_of_budgets_stops_at_environment_steps():
-    module = adapter()
-    budget = module.StepBudget(25)
-    budget.locals = {"infos": [{"steps": 10}, {"steps": 2}]}
-    assert [budget._on_step(), budget._on_step(), budget._on_step()] == [True, True, False]
 
 
 def test_the_tutorials_job_takes_a_third_of_its_lines():

@@ -97,20 +97,8 @@ def test_the_same_seed_gives_the_same_weights(name, workers, tmp_path):
     assert not same(runs[0], runs[2])
 
 
-def test_two_processes_begin_in_different_places(tmp_path):
-    file = tmp_path / "starts"
-    train(drawing("numpy.random", file), tmp_path / "run", workers=2)
-    starts = {}
-    for line in file.read_text().splitlines():
-        process, x = line.split()
-        starts.setdefault(process, set()).add(x)
-    starts.pop(str(os.getpid()), None)
-    assert len(starts) == 2
-    assert not set.intersection(*starts.values())
-
-
-def test_environments_that_draw_when_they_are_made_differ_between_processes(tmp_path):
-    class Built(Corridor):
+def test_environments_of_two_processes_draw_other_numbers_when_made_and_when_they_begin(tmp_path):
+    class Built(drawing("numpy.random", tmp_path / "starts")):
         def __init__(self):
             self.length = float(np.random.uniform())
             if multiprocessing.parent_process() is not None:
@@ -120,6 +108,13 @@ def test_environments_that_draw_when_they_are_made_differ_between_processes(tmp_
     sw.train_agent(spec, SMALL, 128, tmp_path / "run", quiet=True)
     lengths = [f.name.split("-")[1] for f in tmp_path.iterdir() if "-" in f.name]
     assert len(lengths) == len(set(lengths)) == 4
+    starts = {}
+    for line in (tmp_path / "starts").read_text().splitlines():
+        process, x = line.split()
+        starts.setdefault(process, set()).add(x)
+    starts.pop(str(os.getpid()), None)
+    assert len(starts) == 2
+    assert not set.intersection(*starts.values())
 
 
 class Everywhere(Corridor):
@@ -177,21 +172,28 @@ def test_generators_of_the_caller_stand_where_they_stood_after(use, everywhere, 
         USES[use](everywhere, tmp_path)
 
 
-def test_environments_of_skills_are_made_from_the_seed(everywhere):
-    made = []
+def test_what_a_seed_makes_of_a_run_is_the_same_again(everywhere, tmp_path):
+    made, films = [], []
     for number, seed in enumerate((1, 1, 2)):
         disturb(number)
         env = sw.envs.make_options_env(everywhere, 2, 0.99, seed=seed)
         made.append([one.unwrapped.weight for one in env.engine.envs])
         env.close()
+        everywhere.render(tmp_path / f"{number}.gif", episodes=2, seed=seed, quiet=True)
+        films.append((tmp_path / f"{number}.gif").read_bytes())
     assert made[0] == made[1] != made[2]
+    assert films[0] == films[1] != films[2]
 
 
-def test_two_films_of_a_run_are_the_same(everywhere, tmp_path):
-    for number in (1, 2):
-        disturb(number)
-        everywhere.render(tmp_path / f"{number}.gif", episodes=2, quiet=True)
-    assert (tmp_path / "1.gif").read_bytes() == (tmp_path / "2.gif").read_bytes()
+def test_an_evaluation_gives_the_same_again_and_says_nothing_of_resuming(tmp_path):
+    run = train(drawing("torch"), tmp_path / "run")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        one, two, other = (
+            sw.evaluate(run.policy, drawing("torch"), episodes=3, seed=seed) for seed in (1, 1, 2)
+        )
+    assert one.returns == two.returns
+    assert one.returns != other.returns
 
 
 def test_they_stand_where_they_stood_after_trainings_in_threads(tmp_path):
@@ -223,15 +225,6 @@ def test_they_stand_where_they_stood_after_trainings_in_threads(tmp_path):
         one.join()
         two.join()
     assert [run.path.name for run in runs] == ["Waiting", "Late"]
-
-
-def test_an_evaluation_gives_the_same_again(tmp_path):
-    run = train(drawing("torch"), tmp_path / "run")
-    one, two, other = (
-        sw.evaluate(run.policy, drawing("torch"), episodes=3, seed=seed) for seed in (1, 1, 2)
-    )
-    assert one.returns == two.returns
-    assert one.returns != other.returns
 
 
 @pytest.mark.parametrize(
@@ -271,13 +264,6 @@ def test_weights_do_not_depend_on_how_often_a_run_is_evaluated(name, learn, tmp_
         files = sorted((folder / "policies").glob("*.safetensors"))
         found.append({f"{f.name} {k}": v for f in files for k, v in load_file(f).items()})
     assert same(*found)
-
-
-def test_an_evaluation_alone_says_nothing_of_resuming(tmp_path):
-    run = train(drawing("random"), tmp_path / "run")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        sw.evaluate(run.policy, drawing("random"), episodes=2)
 
 
 def test_threads_that_share_a_generator_are_promised_nothing(tmp_path, capsys):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from declaring import Other, declare
 from small_runs import Heard, Left, Push, assert_same, new_run
-from together_runs import Other, declare
 
 from skillweave import SkillweaveError
 from skillweave._internal.prefixes import unprefixed
@@ -94,14 +94,3 @@ def test_a_run_killed_while_it_was_judged_is_judged_when_it_is_resumed(
     then().resume(run.path, quiet=True)
     assert_same(run.path, whole[0])
     assert then().load(run.path).evaluate(3) == then().load(whole[0]).evaluate(3)
-
-
-def test_a_damaged_state_is_told(tmp_path):
-    run = new_run(then(), tmp_path / "run")
-    with pytest.raises(KeyboardInterrupt):
-        training.train(then(), run, (StopAfter("selector"),))
-    run.close()
-    file = run.path / "states" / "left.safetensors"
-    file.write_bytes(file.read_bytes()[:-8])
-    with pytest.raises(SkillweaveError, match=r"left\.safetensors"):
-        then().resume(run.path, quiet=True)

@@ -23,41 +23,52 @@ def module():
     return torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 2))
 
 
-POLICIES = {"function": right, "module": module(), "policy": sw.from_function(right)}
-TRAINING = {
-    "algorithm": SMALL,
-    "steps": 100,
-    "task_weight": 0.5,
-    "target_return": 10.0,
-}
-
-
 def declare(*skills):
     return sw.Hierarchy("CartPole-v1", skills, algorithm=SMALL, selector=SMALL, steps=32)
 
 
-@pytest.mark.parametrize("field", TRAINING)
-@pytest.mark.parametrize("policy", POLICIES.values(), ids=POLICIES)
-def test_a_skill_with_a_policy_takes_no_settings_of_training(policy, field):
-    skill = type("Cloned", (sw.Skill,), {"policy": policy, field: TRAINING[field]})()
-    with pytest.raises(DeclarationError, match=f"'cloned' has a policy.* its {field} would be"):
-        declare(skill)
+def cloned(policy=right, **settings):
+    return type("Cloned", (sw.Skill,), {"policy": policy, **settings})()
 
 
-def test_all_settings_that_would_be_ignored_are_named():
-    class Cloned(sw.Skill):
-        algorithm = SMALL
-        steps = 100
-        target_success = 0.5
+def with_later(skill, **settings):
+    for name, value in settings.items():
+        setattr(skill, name, value)
+    return skill
 
-        def policy(self, obs):
-            return right(obs)
 
-        def success(self, step):
-            return step.terminated
+class Ready(sw.Skill):
+    policy = right
 
-    with pytest.raises(DeclarationError, match="algorithm and steps and target_success would"):
-        declare(Cloned())
+
+REFUSED = {
+    "algorithm": (lambda: cloned(algorithm=SMALL), "algorithm"),
+    "steps": (lambda: cloned(steps=100), "steps"),
+    "task_weight": (lambda: cloned(task_weight=0.5), "task_weight"),
+    "target_return": (lambda: cloned(target_return=10.0), "target_return"),
+    "a module": (lambda: cloned(module(), steps=100), "steps"),
+    "a policy": (lambda: cloned(sw.from_function(right), steps=100), "steps"),
+    "several": (
+        lambda: cloned(algorithm=SMALL, steps=9, target_success=0.5, success=Ready.termination),
+        "algorithm and steps and target_success",
+    ),
+    "a subclass": (lambda: type("Further", (Ready,), {"algorithm": SMALL})(), "algorithm"),
+    "set later": (lambda: with_later(Ready(), steps=100), "steps"),
+    "policy first": (
+        lambda: with_later(sw.Skill(), name="x", policy=right, algorithm=SMALL),
+        r"algorithm would be ignored: leave out algorithm \(or .*skill\.algorithm = None\)",
+    ),
+    "policy last": (
+        lambda: with_later(sw.Skill(), name="x", algorithm=SMALL, policy=right),
+        r"algorithm would be ignored: leave out algorithm \(or .*skill\.algorithm = None\)",
+    ),
+}
+
+
+@pytest.mark.parametrize(("make", "says"), REFUSED.values(), ids=REFUSED)
+def test_a_skill_with_a_policy_takes_no_settings_of_training(make, says):
+    with pytest.raises(DeclarationError, match=f"' has a policy.* its {says}"):
+        declare(make())
 
 
 class Trains(sw.Skill):
@@ -69,51 +80,16 @@ class Trains(sw.Skill):
 
 
 def test_a_policy_that_comes_later_takes_the_place_of_a_training():
-    class Ready(Trains):
+    class Later(Trains):
         policy = right
 
-    later = Trains()
-    later.policy = right
-    for skill in (Ready(), later):
+    freed = with_later(sw.Skill(), name="x", policy=right, algorithm=SMALL)
+    freed.algorithm = None
+    for skill in (Later(), with_later(Trains(), policy=right), freed):
         declared = declare(skill)
         assert [stage.kind for stage in declared.stages()] == ["selector"]
         declared.scale(0.5)
         declared.validate()
-
-
-def test_settings_that_come_later_are_refused_too():
-    class Ready(sw.Skill):
-        policy = right
-
-    class Further(Ready):
-        algorithm = SMALL
-
-    later = Ready()
-    later.steps = 100
-    for skill, field in ((Further(), "algorithm"), (later, "steps")):
-        with pytest.raises(DeclarationError, match=f"its {field} would be ignored"):
-            declare(skill)
-
-
-@pytest.mark.parametrize("first", ["policy", "algorithm"])
-def test_a_policy_and_settings_of_training_on_one_object_are_refused_in_any_order(first):
-    class Ready(sw.Skill):
-        def __init__(self):
-            for name in sorted(("policy", "algorithm"), key=lambda name: name != first):
-                setattr(self, name, {"policy": right, "algorithm": SMALL}[name])
-
-    says = r"its algorithm would be ignored: leave out algorithm \(or .*skill\.algorithm = None\)"
-    with pytest.raises(DeclarationError, match=says):
-        declare(Ready())
-    skill = Ready()
-    skill.algorithm = None
-    assert [stage.kind for stage in declare(skill).stages()] == ["selector"]
-
-
-def test_a_ready_skill_of_another_run_takes_none_either(tmp_path):
-    run = sw.train_agent("CartPole-v1", SMALL, 16, tmp_path / "run", quiet=True)
-    with pytest.raises(DeclarationError, match=r"'moves' has a policy.* its steps would be"):
-        declare(run.as_skill("moves", steps=10))
 
 
 class Model:
@@ -146,16 +122,15 @@ def test_start_from_shows_the_way_of_what_is_no_run(tmp_path, value, way, named)
     assert not (tmp_path / "run").exists()
 
 
-def test_stable_baselines_leaves_out_the_ending(tmp_path):
+def test_a_file_may_lack_its_ending_and_a_run_may_be_called_anything(tmp_path):
     (tmp_path / "best.zip").write_bytes(b"")
     with pytest.raises(DeclarationError, match=r"best.zip', \"ppo\""):
         sw.train_agent("CartPole-v1", SMALL, 16, start_from=tmp_path / "best", quiet=True)
-
-
-def test_a_folder_may_be_called_anything(tmp_path):
     there = tmp_path / "first.zip"
-    sw.train_agent("CartPole-v1", SMALL, 16, there, quiet=True)
+    run = sw.train_agent("CartPole-v1", SMALL, 16, there, quiet=True)
     sw.train_agent("CartPole-v1", SMALL, 16, tmp_path / "run", start_from=there, quiet=True)
+    with pytest.raises(DeclarationError, match=r"'moves' has a policy.* its steps would be"):
+        declare(run.as_skill("moves", steps=10))
 
 
 LEARNT = module()

@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from declaring import plainly
+from declaring import declare as small
+from playing import episode
 from small_runs import (
     MEMORY,
     OFF,
@@ -38,14 +39,12 @@ from skillweave import (
     Together,
 )
 from skillweave.cli import main
-from skillweave.envs.make import make_engine
 from skillweave.hierarchy.roles import roles_of
 from skillweave.hierarchy.select_best import resolve_greedy
 from skillweave.planning.columns import ENDS
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import episode_seeds, evaluate
-from skillweave.training.play import SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
@@ -58,27 +57,36 @@ class Right(Skill):
         return step.next_obs[:, 0]
 
 
-def options(**how):
-    told = {"env": CARTPOLE, "algorithm": ON, "selector": ON, "skill_steps": 150}
-    return told | {"selector_steps": 150, "together_steps": 450, "checkpoint_every": 75} | how
-
-
 def inside(*skills, **how):
     skills = skills or (Balance(), Right())
-    return Hierarchy(skills=skills, **plainly(options(call_steps=3, name="inner") | how))
+    return small(*skills, **{"call_steps": 3, "name": "inner", "learn": "apart"} | how)
 
 
 def declare(inner=None, **how):
     """Left, a hierarchy of balance and right, and a ready skill."""
     inner = inside() if inner is None else inner
-    return Hierarchy(skills=[Left(), inner, Push()], **plainly(options(call_steps=7) | how))
+    return small(Left(), inner, Push(), **{"call_steps": 7, "learn": "apart"} | how)
 
 
-def test_selectors_of_all_levels_have_the_floor_of_learning_together():
+def test_selectors_and_critics_of_all_levels_have_the_settings_of_learning_together():
     told = Together(epsilon=0.8, epsilon_final=0.2, epsilon_fraction=0.3, task_weight=0.0)
     (stage,) = declare(learn="together", together=told).stages()
     for config in (stage.config, stage.beside["inner/selector"]):
         assert (config.epsilon, config.epsilon_final, config.epsilon_fraction) == (0.8, 0.2, 0.3)
+    (stage,) = KINDS["interrupted"]().stages()
+    critics = [c for k, c in stage.beside.items() if k.endswith("skill_critic")]
+    assert [critic.deciding for critic in critics] == [True, True]
+
+
+def test_budgets_of_all_levels_count_and_are_scaled():
+    found = declare()
+    assert found.total_steps == (150 + 150 + 150) + 150 + 150
+    found.scale(2.0)
+    assert found.total_steps == 1500
+    together = declare(learn="together")
+    assert together.total_steps == 450
+    together.env = replace(together.spec, workers=2)  # the outermost says it
+    together.check_spaces()
 
 
 class Careful(Skill):
@@ -104,7 +112,7 @@ def three():
     """A hierarchy in a hierarchy in a hierarchy."""
     deepest = inside(Right(), Push(), call_steps=2, name="deepest")
     middle = inside(Balance(), deepest, call_steps=4, name="middle", interrupt=True)
-    return Hierarchy(skills=[Left(), middle], **plainly(options(call_steps=7, learn="together")))
+    return small(Left(), middle, call_steps=7)
 
 
 class InParts(gym.ObservationWrapper):
@@ -140,9 +148,7 @@ class LeansRight(Skill):
 def in_parts():
     env = replace(CARTPOLE, wrappers=[InParts])
     inner = inside(LeansLeft(), LeansRight(), env=env)
-    return Hierarchy(
-        skills=[LeansRight(), inner], **plainly(options(call_steps=7, learn="together", env=env))
-    )
+    return small(LeansRight(), inner, call_steps=7, env=env)
 
 
 BUSY = {"call_steps": Lengths(1, ..., 8), "interrupt": True}
@@ -251,46 +257,8 @@ def test_selectors_at_all_levels_stay_near_their_guides(whole):
     run, path = whole("guides")
     told = {name for line in lines(path) if line["stage"] == "together" for name in line}
     assert {"selector.reference_kl", "inner/selector.reference_kl"} <= told
-    inner = run.policy.skills.policies[1]
     assert run.policy.guide is None
-    assert inner.guide.restricts
-
-
-def watch(run, look):
-    """Play a run's policy for a while; ``look`` at its memory before each step."""
-    engine = make_engine(CARTPOLE, 1)
-    engine.reset(0)
-    rng = np.random.default_rng(0)
-    episodes = SeededEpisodes(engine, range(9), 100)
-    list(play(run.policy, episodes, deterministic=False, rng=rng, before_step=look))
-
-
-def test_a_guide_in_a_hierarchy_below_is_kept_to(whole):
-    run, _ = whole("guides, start calls")
-    called = set()
-
-    def look(memory):
-        high = memory["1"]["guide"]["state"] == 1
-        acts = (memory["skill"] == 1) & (memory["1"]["elapsed"] == 0)
-        called.update(memory["1"]["skill"][acts & high].tolist())
-
-    watch(run, look)
-    assert called == {1}
-
-
-def test_another_guide_below_is_refused_by_its_path(tmp_path, whole):
-    run, path = whole("guides, start calls")
-    other = declare(inside(guide=lambda obs: 0, call_steps=Lengths(1, 2)))
-    with pytest.raises(SkillweaveError, match="inner: the selector has a guide"):
-        declare().load(path)
-    with (
-        pytest.raises(SkillweaveError, match="guide of inner"),
-        pytest.warns(match=r"call_steps of 'inner' is 3 .declared now: Lengths\(1, 2\)"),
-    ):
-        other.load(path)
-    run.save_weights(tmp_path / "weights")
-    with pytest.raises(SkillweaveError, match="inner: the selector has a guide"):
-        declare().load_weights(tmp_path / "weights")
+    assert run.policy.skills.policies[1].guide.restricts
 
 
 def test_all_go_on_with_their_whole_states_by_path(tmp_path):
@@ -304,6 +272,22 @@ def test_all_go_on_with_their_whole_states_by_path(tmp_path):
     entry.kept = judged
     KINDS["then, inside and outside"]().resume(run.path, quiet=True)
     assert not (run.path / "states").exists()
+
+
+def test_a_run_is_described_and_evaluated_by_the_paths_of_its_skills(whole, capsys):
+    run, path = whole("together")
+    run.evaluate(3, save=True)
+    assert main(["info", str(path)]) == 0
+    told = capsys.readouterr().out
+    for name in ("inner ", "inner/balance", "inner/right"):
+        assert name in told
+    assert run.evaluate(2, skill="inner/balance").mean > 0
+    with pytest.raises(SkillweaveError, match="inner/balance"):
+        run.evaluate(2, skill="inner/nobody")
+    player = run.player(deterministic=False)
+    acting = {run.policy.acts(player.memory) for _ in episode(CARTPOLE.make(), player)}
+    assert acting & {"inner/right", "inner/balance"}, "captions of films"
+    assert acting <= {"left", "inner/right", "inner/balance", "push"}
 
 
 def test_calls_are_logged_by_the_paths_of_who_acts(whole):
@@ -339,37 +323,6 @@ def test_a_run_has_everyones_file_with_a_checksum(whole):
     assert all(s.sha256 or all(s.policies.values()) for s in stages.values())
 
 
-def test_a_policy_in_anothers_place_is_refused(tmp_path, whole):
-    copy = RunDirectory.open(shutil.copytree(whole("apart")[1], tmp_path / "run"))
-    one, other = (copy.policy_path(f"inner/{k}") for k in ("balance", "right"))
-    one.write_bytes(other.read_bytes())
-    with pytest.raises(SkillweaveError, match="holds the policy of stage 'inner/right'"):
-        declare().load(copy.path)
-
-
-def test_info_names_all_levels(whole, capsys):
-    run, path = whole("together")
-    run.evaluate(3, save=True)
-    assert main(["info", str(path)]) == 0
-    told = capsys.readouterr().out
-    for name in ("inner ", "inner/balance", "inner/right"):
-        assert name in told
-
-
-def test_a_skill_of_a_hierarchy_below_acts_alone(whole):
-    run, _ = whole("together")
-    assert run.evaluate(2, skill="inner/balance").mean > 0
-    with pytest.raises(SkillweaveError, match="inner/balance"):
-        run.evaluate(2, skill="inner/nobody")
-
-
-def test_captions_name_the_path(whole):
-    run, _ = whole("together")
-    seen = set()
-    watch(run, lambda memory: seen.add(run.policy.acts(memory)))
-    assert {"left", "inner/right"} <= seen <= {"left", "inner/right", "inner/balance", "push"}
-
-
 class Task(Skill):
     """Has no code of its own."""
 
@@ -381,11 +334,8 @@ class Short(Skill):
 
 
 def test_a_run_without_code_is_loaded_from_its_own_record(tmp_path, capsys):
-    plain = options(env="CartPole-v1", call_steps=3)
-    inner = Hierarchy(
-        skills=[Short(), Task()], **plainly(plain | {"name": "inner", "call_steps": 2})
-    )
-    found = Hierarchy(skills=[Task(), inner], **plainly(plain | {"learn": "together"}))
+    inner = inside(Short(), Task(), env="CartPole-v1", call_steps=2)
+    found = small(Task(), inner, env="CartPole-v1", call_steps=3)
     run = found.train(tmp_path / "run", quiet=True)
     assert not run.info()["needs_recipe"]
     again = Hierarchy.from_manifest(run.info()).load(run.path)
@@ -395,31 +345,41 @@ def test_a_run_without_code_is_loaded_from_its_own_record(tmp_path, capsys):
     assert "inner/short" in capsys.readouterr().out
 
 
-def test_a_run_of_other_levels_is_refused(whole):
+def test_a_run_of_other_levels_or_with_a_policy_in_anothers_place_is_refused(tmp_path, whole):
     _, path = whole("apart")
     for other in (declare(inside(Right(), Balance())), declare(inside(name="other"))):
         with pytest.raises(SkillweaveError, match="inner/balance, inner/right"):
             other.load(path)
     with pytest.raises(SkillweaveError, match=r"inner has a trained selector, but .* a ready one"):
         declare(inside(selector=ready)).load(path)
+    copy = RunDirectory.open(shutil.copytree(path, tmp_path / "run"))
+    one, other = (copy.policy_path(f"inner/{k}") for k in ("balance", "right"))
+    one.write_bytes(other.read_bytes())
+    with pytest.raises(SkillweaveError, match="holds the policy of stage 'inner/right'"):
+        declare().load(copy.path)
+
+
+def test_another_guide_below_is_refused_by_its_path(tmp_path, whole):
+    run, path = whole("guides, start calls")
+    other = declare(inside(guide=lambda obs: 0, call_steps=Lengths(1, 2)))
+    with (
+        pytest.raises(SkillweaveError, match="guide of inner"),
+        pytest.warns(match=r"call_steps of 'inner' is 3 .declared now: Lengths\(1, 2\)"),
+    ):
+        other.load(path)
+    weights = run.save_weights(tmp_path / "weights")
+    for load, source in ((declare().load, path), (declare().load_weights, weights)):
+        with pytest.raises(SkillweaveError, match="inner: the selector has a guide"):
+            load(source)
 
 
 @pytest.mark.slow
 def test_a_hierarchy_of_a_run_can_be_a_skill_beside_one_that_is_trained(tmp_path, whole):
     run, _ = whole("apart")
-    both = [run.as_skill("done"), inside()]
-    found = Hierarchy(skills=both, **plainly(options(call_steps=5, learn="together")))
+    found = small(run.as_skill("done"), inside(), call_steps=5)
     made = found.train(tmp_path / "run", quiet=True)
     assert {k.partition("/")[0] for k in made.evaluate(2).skills} == {"done", "inner"}
     assert found.load(tmp_path / "run").evaluate(2) == made.evaluate(2)
-
-
-def test_budgets_of_all_levels_count_and_are_scaled():
-    found = declare()
-    assert found.total_steps == (150 + 150 + 150) + 150 + 150
-    found.scale(2.0)
-    assert found.total_steps == 1500
-    assert declare(learn="together").total_steps == 450
 
 
 class Forever(Skill):
@@ -439,6 +399,11 @@ def gains_itself():
     found = declare()
     found.skills = (*found.skills, found.as_skill("again"))
     return found.train("never", quiet=True)
+
+
+class Broken(Skill):
+    def reward(self, step):
+        return np.full(len(step.reward), np.nan)
 
 
 def trained_twice():
@@ -471,6 +436,10 @@ WRONG = {
         "skill 'careful' is a hierarchy, so it has no algorithm",
     ),
     "no such attribute": (lambda: inside().as_skill(cal_steps=3), "cal_steps"),
+    "a reward that cannot be": (
+        lambda: declare(inside(Broken()), learn="together").train("never", quiet=True),
+        "'inner/broken'",
+    ),
     "an algorithm that cannot": (
         lambda: declare(inside(algorithm=TD3(num_envs=4))).check_spaces(),
         "'inner/balance'",
@@ -483,21 +452,6 @@ def test_bad_declarations_are_told_by_path(case):
     make, told = WRONG[case]
     with pytest.raises(SkillweaveError, match=told):
         make()
-
-
-def test_how_many_processes_step_the_environments_is_said_by_the_outermost():
-    found = declare(learn="together")
-    found.env = replace(found.spec, workers=2)
-    found.check_spaces()
-
-
-def test_errors_of_skills_below_name_their_path(tmp_path):
-    class Broken(Skill):
-        def reward(self, step):
-            return np.full(len(step.reward), np.nan)
-
-    with pytest.raises(SkillweaveError, match="'inner/broken'"):
-        declare(inside(Broken()), learn="together").train(tmp_path / "run", quiet=True)
 
 
 def stage(name, kept):
@@ -534,10 +488,3 @@ def test_whether_skills_are_greedy_is_what_the_latest_stage_says_that_counts(sta
     declared = declare(inside(greedy_skills=False), greedy_skills=True)
     said = resolve_greedy(roles_of(declared), run).levels.values()
     assert [level.selection.greedy_skills for level in said] == [True, False]
-
-
-def test_critics_learn_what_deciding_is_worth_at_every_level_where_calls_are_cut():
-    (stage,) = KINDS["interrupted"]().stages()
-    critics = {k: c for k, c in stage.beside.items() if k.endswith("skill_critic")}
-    assert len(critics) == 2
-    assert all(critic.deciding for critic in critics.values())

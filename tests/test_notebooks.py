@@ -82,15 +82,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return hierarchy(steps=200).train(tmp_path_factory.mktemp("runs") / "run", quiet=True)
 
 
-def test_a_table_escapes_everything():
+def test_a_skill_and_an_agent_tell_what_they_declare_and_all_is_escaped():
     text = table(["<a>"], [["<script>alert(1)</script>", 3], ['"&', None]])
     assert "<script>" not in text
     assert "&lt;script&gt;" in text
     assert "&quot;&amp;" in text
     assert Well(joined([text, facts([("<x>", "<y>")])])).words[0] == "<a>"
-
-
-def test_a_skill_tells_what_it_declares():
+    agent = Agent("CartPole-v1", TINY, 3_000)
+    assert repr(agent) == "<Agent of PPO on CartPole-v1>"
+    assert "3,000" in read(agent).words
     assert repr(Center()) == "<Skill 'center': reward, max_steps=20>"
     assert repr(Skill()) == "<Skill '': all defaults>"
     assert repr(Idle()).startswith("<Skill 'idle': policy=")
@@ -110,40 +110,25 @@ def test_a_hierarchy_tells_its_skills_at_all_levels():
     assert words[words.index("inner") + 1] == "hierarchy"
 
 
-def test_an_agent_tells_what_it_learns():
-    agent = Agent("CartPole-v1", TINY, 3_000)
-    assert repr(agent) == "<Agent of PPO on CartPole-v1>"
-    assert "3,000" in read(agent).words
-
-
-def test_a_run_tells_its_stages_and_its_evaluation(run):
+def test_a_run_tells_its_stages_and_its_evaluation_damaged_or_gone_or_without_code(run, tmp_path):
     assert repr(run) == f"<Run {run.path}: Hierarchy of center, idle on CartPole-v1>"
     assert "evaluation" not in "".join(read(run).words)
     run.evaluate(2, save=True)
     words = read(run).words
     assert {str(run.path), "center", "idle", "together", "done"} <= set(words)
     assert words[-1].startswith("evaluation: ")
-
-
-def test_a_run_that_is_damaged_or_gone_is_shown_all_the_same(run, tmp_path):
     gone = Run(run.declaration, tmp_path / "gone", run.policy)
     assert "center" in read(gone).words
     (tmp_path / "run.json").write_text("{")
     assert "run.json" in read(Run(run.declaration, tmp_path, run.policy)).words[-1]
-
-
-def test_a_run_of_recorded_skills_is_shown(run, tmp_path):
     again = Hierarchy.from_manifest({**run.info(), "needs_recipe": False})
     assert "learnt" in read(again).words
 
 
-def test_an_evaluation_is_a_line_and_a_table():
+def test_an_evaluation_is_a_line_and_a_table_of_its_skills(run):
     plain = Evaluation((1.0, 2.0), (3, 4), None)
     assert repr(plain) == f"<Evaluation: {plain}>"
     assert read(plain).words == [str(plain)]
-
-
-def test_an_evaluation_of_skills_has_a_table_of_them(run):
     found = run.evaluate(2)
     words = read(found).words
     assert words[0] == str(found)
@@ -198,7 +183,7 @@ select_best.MOST = 4""",
 """What takes long in the example, and what the test does instead."""
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def outputs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Any]]:
     """What each cell of code of the example shows, with few steps."""
     client = pytest.importorskip("nbclient")
@@ -219,7 +204,7 @@ def outputs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Any]]:
 
 
 @pytest.mark.slow
-def test_the_example_shows_tables_and_films_and_nothing_raw(outputs):
+def test_the_example_shows_tables_films_and_its_last_progress_and_nothing_raw(outputs):
     shown = [output for cell in outputs for output in cell]
     assert {output.output_type for output in shown} == {"execute_result", "display_data"}
     for output in shown:
@@ -234,10 +219,6 @@ def test_the_example_shows_tables_and_films_and_nothing_raw(outputs):
     assert set(results) == {"<Hierarchy", "<Run", "<Evaluation:", "<Film"}
     assert all("<table>" in results[k] for k in ("<Hierarchy", "<Run", "<Evaluation:"))
     assert "data:image/gif;base64,R0lGOD" in results["<Film"]
-
-
-@pytest.mark.slow
-def test_training_in_the_example_leaves_its_last_progress(outputs):
     html = outputs[2][0].data["text/html"]
     assert "<progress" in html
     assert "done in" in html

@@ -57,19 +57,14 @@ def test_pages_show_whole_files_that_exist():
     assert [path for path in shown if not (ROOT / path).is_file()] == []
 
 
-@pytest.mark.parametrize("page", [README, *PAGES], ids=name)
-def test_every_command_of_a_page_exists(page):
-    used = set(re.findall(r"^\s*skillweave ([\w-]+)", page.read_text(), flags=re.M))
-    assert used <= {name_of(c) for c in COMMANDS}
-
-
-@pytest.mark.parametrize("page", [README, *PAGES], ids=name)
-def test_modules_that_a_page_tells_to_run_exist(page):
-    modules = re.findall(r"python -m (benchmarks\.\w+)", page.read_text())
-    places = {m: ROOT / m.replace(".", "/") for m in modules}
-    there = {m for m, p in places.items() if p.with_suffix(".py").is_file()}
-    there |= {m for m, p in places.items() if (p / "__main__.py").is_file()}
-    assert [m for m in modules if m not in there] == []
+def test_commands_and_modules_that_pages_tell_to_run_exist():
+    known = {name_of(c) for c in COMMANDS}
+    for page in (README, *PAGES):
+        text = page.read_text()
+        assert set(re.findall(r"^\s*skillweave ([\w-]+)", text, flags=re.M)) <= known, page
+        for module in re.findall(r"python -m (benchmarks\.\w+)", text):
+            place = ROOT / module.replace(".", "/")
+            assert place.with_suffix(".py").is_file() or (place / "__main__.py").is_file(), page
 
 
 def test_every_public_name_stands_in_the_reference_once():
@@ -80,12 +75,30 @@ def test_every_public_name_stands_in_the_reference_once():
     assert sorted(p for p in found if p[0] in HOMES) == sorted(names)
 
 
-@pytest.mark.parametrize("page", sorted((ROOT / "docs/suites").glob("*.md")), ids=name)
-def test_a_page_about_a_suite_names_its_command(page):
-    assert "python -m benchmarks.pay" in page.read_text()
-
-
-def test_every_table_of_results_has_its_command():
+def test_every_page_about_a_suite_and_every_table_of_results_has_its_command():
+    suites = sorted((ROOT / "docs/suites").glob("*.md"))
+    assert [page for page in suites if "python -m benchmarks.pay" not in page.read_text()] == []
     sections = re.split(r"^## ", (ROOT / "docs/results.md").read_text(), flags=re.M)[1:]
     assert len(sections) >= 6
     assert [s.splitlines()[0] for s in sections if "python -m benchmarks." not in s] == []
+
+
+# The README
+
+
+def test_the_example_of_the_readme_is_one_of_the_examples():
+    """``test_examples.py`` runs it."""
+    (block,) = re.findall(r"^```python\n(.*?)^```", README.read_text(), flags=re.S | re.M)
+    assert (ROOT / "examples/key_door.py").read_text().endswith(block)
+
+
+def test_links_and_targets_of_make_in_the_readme_exist_and_it_installs_the_small_torch_first():
+    text, makefile = README.read_text(), (ROOT / "Makefile").read_text()
+    links = re.findall(r"\]\((?!http)([^)#]+)", text)
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
+    used = set(re.findall(r"`make ([\w-]+)`", text, flags=re.M))
+    assert {"demo", "test"} <= used
+    assert [t for t in used if not re.search(rf"^{t}:", makefile, flags=re.M)] == []
+    installs = re.findall(r"^pip install .*$", text, flags=re.M)
+    assert "download.pytorch.org/whl/cpu" in installs[0]

@@ -27,28 +27,14 @@ def test_a_path_is_its_level_and_its_name(path):
     assert relative(path, level_of(path)) == name_of(path)
 
 
-def test_the_outermost_level_is_empty():
-    assert level_of("skill") == ""
-    assert names_in("") == ()
-    assert join("", "skill") == "skill"
+def test_levels_lead_from_the_outermost_which_is_empty_to_what_has_their_whole_name():
+    assert (level_of("skill"), names_in(""), join("", "skill")) == ("", (), "skill")
     assert not is_below("", "")
     assert relative("inner/skill", "") == "inner/skill"
-
-
-def test_levels_lead_from_the_outermost_to_the_path():
     assert levels_to("") == [""]
     assert levels_to("a/b/c") == ["", "a", "a/b", "a/b/c"]
-
-
-def test_below_a_level_stands_what_has_its_whole_name():
     by_path = {"inner": 0, "inner/a": 1, "inner/b/c": 2, "inner2/a": 3, "a": 4}
     assert below(by_path, "inner") == {"a": 1, "b/c": 2}
     assert below(by_path, "") == by_path
-
-
-@pytest.mark.parametrize(
-    ("path", "it_does"),
-    [("selector", True), ("a/b/skill_critic", True), ("selector/a", False), ("myselector", False)],
-)
-def test_selectors_and_critics_decide(path, it_does):
-    assert decides(path) is it_does
+    deciding = ["selector", "a/b/skill_critic", "selector/a", "myselector"]
+    assert [decides(path) for path in deciding] == [True, True, False, False]

@@ -60,47 +60,39 @@ def method(name: str) -> str:
 GUARD = "if __name__ == '__main__':\n    "
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["spawn", "forkserver"])
-def test_a_plain_script_trains_in_one_process_where_others_would_run_it_again(name, tmp_path):
-    said = trained(tmp_path, method(name) + TRAIN.format(env="Slow"), 1)
-    assert said.count("__name__ == '__main__'") == 1
-    assert "EnvSpec(workers=2) uses processes" in said
+PLAIN = TRAIN.format(env="Slow")
+FUNCTION = f"\ndef main():\n    {PLAIN}\n"
+NO_MEMORY = (
+    "import tempfile\ndef full(*_):\n    raise OSError(28, 'No space left on device')\n"
+    "tempfile.TemporaryFile = full\n"
+    "if hasattr(os, 'memfd_create'):\n    del os.memfd_create\n"
+)
+LOCKED = (
+    "\nlock = __import__('threading').Lock()\ndef made():\n    lock.locked()\n    return Slow()\n"
+)
+MAIN, SENT = "__name__ == '__main__'", "cannot be sent to another process"
+SCRIPTS = {  # by name: the text, in how many processes it trains, and what is said once
+    **{f"plain, {name}": (method(name) + PLAIN, 1, MAIN) for name in ("spawn", "forkserver")},
+    "plain, fork": (method("fork") + PLAIN, 3, ""),
+    **{
+        f"{where}, {name}": (f"{FUNCTION}{GUARD}{method(name)}    {body}", 3, "")
+        for where, body in (("in the guard", PLAIN), ("in a function", "main()\n"))
+        for name in ("spawn", "forkserver", "fork")
+    },
+    **{
+        f"without shared memory, {name}": (f"{NO_MEMORY}{GUARD}{method(name)}    {PLAIN}", 3, "")
+        for name in ("spawn", "forkserver")
+    },
+    "a lock": (f"{LOCKED}{GUARD}{method('spawn')}    {TRAIN.format(env='made')}", 1, SENT),
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["spawn", "forkserver", "fork"])
-@pytest.mark.parametrize("where", ["in the guard", "in a function"])
-def test_a_guarded_script_trains_in_processes(name, where, tmp_path):
-    train = TRAIN.format(env="Slow")
-    body = {"in the guard": train, "in a function": "main()\n"}[where]
-    trained(tmp_path, f"\ndef main():\n    {train}\n{GUARD}{method(name)}    {body}", 3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["spawn", "forkserver"])
-def test_started_processes_need_no_shared_memory(name, tmp_path):
-    none = (
-        "import tempfile\ndef full(*_):\n    raise OSError(28, 'No space left on device')\n"
-        "tempfile.TemporaryFile = full\n"
-        "if hasattr(os, 'memfd_create'):\n    del os.memfd_create\n"
-    )
-    trained(tmp_path, f"{none}{GUARD}{method(name)}    {TRAIN.format(env='Slow')}", 3)
-
-
-@pytest.mark.slow
-def test_a_plain_script_that_forks_trains_in_processes(tmp_path):
-    trained(tmp_path, method("fork") + TRAIN.format(env="Slow"), 3)
-
-
-@pytest.mark.slow
-def test_what_cannot_be_sent_stays_in_one_process(tmp_path):
-    odd = (
-        "\nlock = __import__('threading').Lock()\n"
-        "def made():\n    lock.locked()\n    return Slow()\n"
-    )
-    said = trained(tmp_path, f"{odd}{GUARD}{method('spawn')}    {TRAIN.format(env='made')}", 1)
-    assert said.count("cannot be sent to another process") == 1
+@pytest.mark.parametrize(("text", "processes", "says"), SCRIPTS.values(), ids=SCRIPTS)
+def test_a_script_trains_in_processes_where_they_can_be_started(text, processes, says, tmp_path):
+    said = trained(tmp_path, text, processes)
+    assert not says or said.count(says) == 1
+    assert ("EnvSpec(workers=2) uses processes" in said) == (processes == 1)
 
 
 @pytest.mark.slow

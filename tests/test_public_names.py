@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import skillweave as sw
-from skillweave import SkillweaveError
 from skillweave._internal.public import HOMES
 
 ROOT = Path(__file__).parents[1]
@@ -29,6 +28,7 @@ SHIPPED = (*HOMES, "skillweave.toys", "skillweave.planning")
 def test_the_public_names_are_these():
     assert sorted(sw.__all__) == sorted(NAMES.split())
     assert len(sw.__all__) == 37
+    assert dir(sw) == sorted(sw.__all__)
 
 
 def imported_deeper(source: str) -> list[str]:
@@ -81,14 +81,3 @@ def test_an_options_env_is_made_of_a_declaration_and_of_a_run(tmp_path):
         env.close()
     assert (seen[0][0] == seen[1][0]).all()
     assert seen[0][1] == pytest.approx([1 + 0.9 + 0.81] * 2)
-
-
-def test_what_cannot_be_an_options_env_is_said():
-    class Learns(sw.Skill):
-        pass
-
-    hierarchy = sw.Hierarchy("CartPole-v1", [Left(), Learns()], learn="apart")
-    with pytest.raises(SkillweaveError, match="skill 'learns' has no policy"):
-        sw.envs.make_options_env(hierarchy, 2, 0.9)
-    with pytest.raises(SkillweaveError, match="gamma is 2"):
-        sw.envs.make_options_env(hierarchy, 2, 2)

@@ -48,13 +48,11 @@ def test_other_roots_names_and_orders_give_other_streams(one, other):
 
 
 @given(st.integers(0, 2**64), paths)
-def test_integers_fit_in_31_bits(root, path):
+def test_integers_fit_in_31_bits_and_differ(root, path):
     node = at(root, path)
-    assert all(0 <= s < 2**31 for s in [node.integer(), *node.integers(5)])
-
-
-def test_integers_differ_from_each_other():
-    assert len(set(Seeds(0).integers(1000))) == 1000
+    found = [node.integer(), *node.integers(500)]
+    assert all(0 <= s < 2**31 for s in found)
+    assert len(set(found)) >= 500
 
 
 def test_no_global_generator_is_touched():
@@ -69,8 +67,3 @@ def test_streams_are_the_same_in_every_version():
     node = Seeds(7) / "landing" / 17
     assert node.integer() == 2105931619
     assert node.numpy().integers(2**31, size=2).tolist() == [1592081194, 723317168]
-
-
-@pytest.mark.parametrize("name", ["", "ü", "a/b"])
-def test_any_text_is_a_name(name):
-    assert (Seeds(0) / name).integer() >= 0

@@ -59,12 +59,14 @@ def test_train_agent_takes_an_agents_settings_and_the_arguments_of_its_training(
     assert [name for name in found if name not in trained] == settings
 
 
-def test_resume_takes_what_belongs_to_a_process_not_to_a_run():
+def test_resume_takes_what_belongs_to_a_process_and_a_plan_the_settings_of_the_planner():
     names = ["run_dir", "quiet", "callback", "evolve", "cluster"]
     assert list(arguments(sw.Hierarchy.resume)) == names
     wanted = options(TrainOptions)
     for name in names[1:]:
         assert arguments(sw.Agent.resume)[name] == wanted[name]
+    planner = arguments(Planner, "log", "task", "skills")
+    assert {k: v for k, v in arguments(sw.Run.plan).items() if k in planner} == planner
 
 
 def described(function):
@@ -129,8 +131,3 @@ def test_defaults_of_training_are_arguments_of_train():
     assert [name for name in arguments(sw.Hierarchy.train) if name in names] == names
     assert OF_TRAIN == AGENT_DEFAULTS
     assert set(AGENT_DEFAULTS) == set(arguments(sw.Agent.train)) & set(names)
-
-
-def test_a_plan_takes_the_settings_of_the_planner():
-    planner = arguments(Planner, "log", "task", "skills")
-    assert {k: v for k, v in arguments(sw.Run.plan).items() if k in planner} == planner

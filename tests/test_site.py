@@ -52,18 +52,18 @@ def test_no_page_fetches_anything_from_elsewhere(site):
     assert found == {}
 
 
-def test_every_public_name_has_its_place_in_the_reference(site):
+def test_the_reference_has_every_public_name_with_plain_types_and_pages_have_pictures(site):
     text = "".join(page.read_text() for page in (site / "reference").glob("*.html"))
     places = [f"{module}.{name}" for module, homes in HOMES.items() for name in homes]
-    missing = [place for place in places if f'id="{place}"' not in text]
-    assert missing == []
-
-
-def test_fields_and_pictures_are_in_the_pages(site):
+    assert [place for place in places if f'id="{place}"' not in text] == []
     skill = (site / "reference/skill.html").read_text()
     assert "always the true successor" in skill  # a comment beside a field of ``Step``
     concepts = (site / "concepts.html").read_text()
     assert concepts.count("<svg class=") >= 3  # drawn in the page, with its colours
+    ppo = (site / "reference" / "ppo.html").read_text()
+    assert "gae_lambda" in ppo
+    checks = r"\b(?:Fraction|AtLeastOne|NonNegative|Annotated|LearningRate)\b"
+    assert re.findall(checks, ppo) == []
 
 
 def test_search_finds_pages_that_are_opened_from_the_disk(site):
@@ -81,10 +81,3 @@ def test_search_finds_pages_that_are_opened_from_the_disk(site):
         first.wait_for(timeout=20_000)
         assert "evolution" in page.locator(".md-search-result__list").inner_text().lower()
         window.close()
-
-
-def test_the_reference_shows_plain_types_not_the_names_of_their_checks(site):
-    text = (site / "reference" / "ppo.html").read_text()
-    assert "gae_lambda" in text
-    found = re.findall(r"\b(?:Fraction|AtLeastOne|NonNegative|Annotated|LearningRate)\b", text)
-    assert found == []

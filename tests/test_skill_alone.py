@@ -93,33 +93,32 @@ def starts(episodes):
     return np.array([env.reset(seed=1_000_000 + i)[0][0] for i in range(episodes)])
 
 
-def test_each_episode_has_a_call_from_its_start_to_the_skills_own_end(run):
-    found, x = run.evaluate(30, skill="reach", quiet=True), starts(30)
+X = starts(30)
+SHORT = np.minimum(3, GOAL - X).sum()
+ALONE = {  # steps of all calls, the own reward, the share that succeeds, why calls end
+    "reach": ((GOAL - X).sum(), -(GOAL - X).sum(), 1.0, {"own": 30}),
+    "short": (SHORT, -SHORT, (X >= 1).mean(), {"own": (X >= 1).sum(), "limit": (X < 1).sum()}),
+    "later": ((GOAL - np.maximum(X, 1)).sum(), None, 1.0, {"own": 30}),
+    "plain": (300, 75.0, None, {"episode": 30}),
+    "learns": (120, None, None, {"limit": 30}),
+}
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_each_episode_has_a_call_from_where_the_skill_may_start_to_its_own_end(run, name):
+    """``call_steps`` of the hierarchy is the selector's; without a reward it is the task's."""
+    steps, own, rate, ended = ALONE[name]
+    found = run.evaluate(30, skill=name, quiet=True)
     assert found.returns == (2.5,) * 30  # the task's, to the end of the episode
-    (report,) = found.skills.values()
-    assert (report.calls, report.ended["own"]) == (30, 30)
-    assert report.steps == (GOAL - x).sum()  # call_steps of the hierarchy is the selector's
-    assert report.return_sum == pytest.approx(-(GOAL - x).sum())
-    assert report.success_rate == 1.0
-
-
-def test_max_steps_end_a_call_and_success_counts_then(run):
-    found, x = run.evaluate(30, skill="short", quiet=True), starts(30)
-    report = found.skills["short"]
-    assert report.ended == {
-        "own": (x >= 1).sum(), "limit": (x < 1).sum(), "interrupted": 0, "episode": 0,
-    }  # fmt: skip
-    assert report.success_rate == pytest.approx((x >= 1).mean())
-    assert 0 < report.success_rate < 1
-    assert report.steps == np.minimum(3, GOAL - x).sum()
-
-
-def test_a_call_begins_where_the_skill_may_start(run):
-    found, x = run.evaluate(30, skill="later", quiet=True), starts(30)
-    report = found.skills["later"]
-    assert report.calls == 30
-    assert report.steps == (GOAL - np.maximum(x, 1)).sum()
     assert found.lengths == (10,) * 30
+    (report,) = found.skills.values()
+    assert (report.calls, report.steps) == (30, steps)
+    assert {k: n for k, n in report.ended.items() if n} == ended
+    assert report.success_rate == (rate if rate is None else pytest.approx(rate))
+    if own is None:
+        assert report.return_sum < 0
+    else:
+        assert report.return_sum == pytest.approx(own)
 
 
 def test_a_skill_that_may_start_nowhere_says_so(run):
@@ -130,40 +129,20 @@ def test_a_skill_that_may_start_nowhere_says_so(run):
     json.dumps(found.to_json(), allow_nan=False)
 
 
-def test_without_a_reward_of_its_own_it_is_the_tasks(run):
-    report = run.evaluate(3, skill="plain", quiet=True).skills["plain"]
-    assert (report.return_mean, report.success_rate) == (2.5, None)
-    assert report.ended["episode"] == report.calls == 3
-
-
-def test_a_trained_skill_is_scored_by_its_own_reward(run):
-    found = run.evaluate(20, skill="learns", quiet=True)
-    report = found.skills["learns"]
-    assert report.steps == 80
-    assert report.return_sum < 0 < found.mean
-
-
 def test_line_table_and_json_have_both_scores(run, capsys):
-    found, x = run.evaluate(30, skill="short", quiet=True), starts(30)
-    share = f"{(x >= 1).mean():.0%}"
-    own = f"{-np.minimum(3, GOAL - x).mean():.1f}"
+    found = run.evaluate(30, skill="short", quiet=True)
+    share = f"{(X >= 1).mean():.0%}"
+    own = f"{-SHORT / 30:.1f}"
     line = f"short alone: 30 calls of 3 steps, {own} by its own reward, {share} succeed"
     assert str(found).startswith("2.50")
     assert line in str(found)
     assert line in found.for_people()
     told = found.to_json()
     assert told["skill"] == "short"
-    assert told["skills"]["short"]["success_rate"] == pytest.approx((x >= 1).mean())
+    assert told["skills"]["short"]["success_rate"] == pytest.approx((X >= 1).mean())
     assert [type(v) for v in told["ci95"]] == [float, float]
     assert json.loads(json.dumps(told)) == told
     assert "skill" not in run.evaluate(3, quiet=True).to_json()
-
-
-class Task(sw.Skill):
-    max_steps = 4
-
-    def reward(self, step):
-        return 3.0 * np.ones(len(step.reward))
 
 
 def test_the_command_line_has_both_scores(tmp_path, capsys):
@@ -177,7 +156,8 @@ def test_the_command_line_has_both_scores(tmp_path, capsys):
         'hierarchy = sw.Hierarchy("CartPole-v1", [Up()], algorithm=settings, selector=settings, '
         "steps=32)\n"
     )
-    assert main(["train", str(recipe), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    train = ["train", str(recipe), "--out", str(tmp_path / "run"), "--quiet", "--evaluate", "0"]
+    assert main(train) == 0
     ask = ["evaluate", str(tmp_path / "run"), "--recipe", str(recipe), "--episodes", "3"]
     capsys.readouterr()
     assert main([*ask, "--skill", "up"]) == 0
@@ -186,15 +166,7 @@ def test_the_command_line_has_both_scores(tmp_path, capsys):
     assert main([*ask, "--skill", "up", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["skill"], told["skills"]["up"]["return_mean"]) == ("up", 12.0)
-
-
-def test_a_run_without_its_code_knows_the_tasks_reward_alone(tmp_path):
-    settings = sw.PPO(num_envs=2, n_steps=8)
-    declared = sw.Hierarchy(
-        "CartPole-v1", [Task()], algorithm=settings, selector=settings, steps=32
-    )
-    declared.train(tmp_path / "run", quiet=True)
-    found = sw.load(tmp_path / "run").evaluate(3, skill="task", quiet=True)
-    assert found.skills["task"].return_mean is None
+    found = sw.load(tmp_path / "run").evaluate(3, skill="up", quiet=True)
+    assert found.skills["up"].return_mean is None, "without its code"
     assert "own reward" not in str(found)
     assert found.mean > 0

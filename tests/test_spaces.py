@@ -3,10 +3,10 @@ import json
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 from hypothesis import given, strategies as st
 
-from skillweave.errors import EnvError, RunError
+from skillweave.errors import RunError
 from skillweave.spaces import (
     action_codec,
     obs_codec,
@@ -38,6 +38,7 @@ def test_observations_are_one_hot_or_floats_of_the_same_value(space, obs, encode
     codec = obs_codec(space)
     vector, images = codec.split(torch.as_tensor(np.asarray(obs, space.dtype)))
     assert images == codec.images == ()
+    assert codec.scaled == isinstance(space, Box), "only real numbers are to be normalised"
     assert vector.dtype == torch.float32
     assert vector.shape[-1] == codec.size
     assert vector.tolist() == encoded
@@ -73,14 +74,6 @@ def test_any_leading_axes_are_kept_and_rows_stay_in_their_place(space, lead):
             assert torch.equal(image.reshape(-1, *picture.shape)[one], picture)
 
 
-def test_only_real_numbers_are_to_be_normalised():
-    assert obs_codec(Box(-1, 1, (2,))).scaled
-    assert not obs_codec(Discrete(3)).scaled
-    assert not obs_codec(MultiBinary(3)).scaled
-    assert not obs_codec(Box(0, 255, (8, 8, 3), np.uint8)).scaled
-    assert obs_codec(Dict({"a": Discrete(3), "b": Box(-1, 1, (2,))})).scaled
-
-
 def test_between_the_parts_of_an_observation_is_nothing():
     space = Dict({"a": Box(-1, 1, (2,), np.float64), "b": MultiBinary(3)})
     batched = {"a": np.ones((4, 2)), "b": np.ones((4, 3), np.int8)}
@@ -90,19 +83,6 @@ def test_between_the_parts_of_an_observation_is_nothing():
         np.full(4 * obs_dtype(space).itemsize, i, np.uint8)  # what memory held before
         found.add(pack(space, batched).tobytes())
     assert len(found) == 1
-
-
-@pytest.mark.parametrize("space", [Text(3), Dict({"a": Tuple((Text(3),))})], ids=str)
-def test_an_unsupported_observation_space_says_which_are_supported(space):
-    with pytest.raises(EnvError, match=r"observation .* Box, Discrete, MultiDiscrete, MultiB"):
-        obs_codec(space)
-
-
-@pytest.mark.parametrize("space", [Box(0, 999, (1,), np.int64), Dict({"a": Text(2)})], ids=str)
-def test_an_unsupported_action_space_says_which_are_supported(space):
-    wanted = "supported are: Discrete, MultiDiscrete, MultiBinary, Box, and Dict and Tuple of these"
-    with pytest.raises(EnvError, match=wanted):
-        action_codec(space)
 
 
 LIMIT = float(np.finfo(np.float32).max)
@@ -233,7 +213,8 @@ def test_whatever_a_policy_chooses_is_in_the_space(space, seed):
         ),
         Box(-2.0, 3.0, (), np.float32),
         Box(0, 255, (2, 2, 3), np.uint8),
-        Discrete(4, start=-2),
+        Box(0, 255, (84, 84, 3), np.uint8),  # bounds that are all equal are one number
+        Discrete(np.int64(4), start=np.int64(-2)),
         MultiDiscrete([[2, 3], [4, 5]], start=[[0, 1], [2, 3]]),
         MultiBinary(3),
         MultiBinary([2, 3]),
@@ -244,6 +225,7 @@ def test_whatever_a_policy_chooses_is_in_the_space(space, seed):
 )
 def test_a_space_survives_json(space):
     text = json.dumps(space_to_json(space), allow_nan=False, sort_keys=True)
+    assert len(text) < 1000
     back = space_from_json(json.loads(text))
     assert same_space(space, back)
     assert back == space
@@ -252,18 +234,6 @@ def test_a_space_survives_json(space):
         assert list(back.spaces) == list(space.spaces)
     if isinstance(space, Box):
         assert np.array_equal(back.bounded_below, space.bounded_below)
-
-
-def test_bounds_that_are_all_equal_are_one_number():
-    pixels = Box(0, 255, (84, 84, 3), np.uint8)
-    text = json.dumps(space_to_json(pixels))
-    assert len(text) < 200
-    assert space_from_json(json.loads(text)) == pixels
-
-
-def test_what_is_written_is_plain_json_without_numpys_numbers():
-    text = json.dumps(space_to_json(Discrete(np.int64(3), start=np.int64(-1))), allow_nan=False)
-    assert space_from_json(json.loads(text)) == Discrete(3, start=-1)
 
 
 def number(value):

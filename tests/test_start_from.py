@@ -8,13 +8,14 @@ from functools import partial
 
 import pytest
 import torch
-from declaring import plainly
+from declaring import declare as small
 from small_runs import MEMORY, OFF, ON, SMALL, Left, Push, Stopped, assert_same, stop_at
 
-from skillweave import PPO, SAC, Agent, Hierarchy, Network, Skill, SkillweaveError, Together
+from skillweave import PPO, SAC, Agent, Network, Skill, SkillweaveError, Together
 from skillweave.algorithms import SelfImitationPPO
 from skillweave.cli import main
 from skillweave.errors import RunError
+from skillweave.evolution import Evolution
 from skillweave.experience.acting import Acting
 from skillweave.hierarchy import training
 from skillweave.runs import directory
@@ -51,11 +52,10 @@ class Other(Skill):
 
 def declare(learn="apart", rate=None, skills=(Left, Other, Push), **how):
     settings = {
-        "call_steps": 5, "skill_steps": 300, "selector_steps": 300, "together_steps": 600,
-        "algorithm": ON, "selector": ON, "checkpoint_every": 100, "greedy_skills": False,
+        "env": "CartPole-v1", "call_steps": 5, "skill_steps": 300, "selector_steps": 300,
+        "together_steps": 600, "checkpoint_every": 100, "greedy_skills": False,
     }  # fmt: skip
-    env = how.pop("env", "CartPole-v1")
-    found = Hierarchy(env, [s() for s in skills], **plainly(settings | how | {"learn": learn}))
+    found = small(*(skill() for skill in skills), **settings | how | {"learn": learn})
     if rate is not None:
         found.algorithm = replace(found.algorithm, learning_rate=rate)
         for who, name in ((found, "selector"), *((s, "algorithm") for s in found.skills)):
@@ -105,7 +105,7 @@ def test_a_plain_agent_begins_with_the_weights_it_ended_with(kind, tmp_path):
     config = AGENTS[kind]
     first = Agent("CartPole-v1", config, 400).train(tmp_path / "first", seed=1, quiet=True)
     still = Agent("CartPole-v1", replace(config, learning_rate=STILL), 200)
-    for start in (first, first.path, str(first.path)):
+    for start in (first, str(first.path)):
         path = tmp_path / f"second-{type(start).__name__}"
         still.train(path, seed=2, quiet=True, start_from=start)
         assert_near(weights_of(path)["agent"], weights_of(first.path)["agent"])
@@ -218,7 +218,7 @@ def test_where_nothing_can_be_copied_no_run_is_begun(source, tmp_path, monkeypat
     with pytest.raises(SkillweaveError, match="No space left"):
         train(tmp_path / "run", source)
     monkeypatch.undo()
-    train(tmp_path / "run", source)
+    begun(tmp_path / "run", source).close()
 
 
 @pytest.mark.slow
@@ -335,15 +335,6 @@ def test_what_cannot_be_is_said_before_anything_is_written(case, source, tmp_pat
     assert not (tmp_path / "run").exists()
 
 
-def test_a_population_does_not_start_from_a_run(source, tmp_path):
-    from skillweave.evolution import Evolution
-
-    evolve = {"selector": Evolution(population=2, generations=2)}
-    with pytest.raises(SkillweaveError, match=r"start_from: stage 'selector' evolves"):
-        declare().train(tmp_path / "run", quiet=True, evolve=evolve, start_from=source)
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.slow
 def test_a_run_that_is_not_finished_gives_what_it_has(source, tmp_path):
     path = tmp_path / "unfinished"
@@ -380,14 +371,12 @@ def test_several_runs_are_a_start_by_the_name_of_who_begins(learn, source, other
     assert runs == {name: manifest_of(path).id for name, path in places.items()}
 
 
-def test_who_is_not_named_begins_afresh(source, tmp_path):
-    train(tmp_path / "run", {"left": source}, rate=STILL)
-    after, before = weights_of(tmp_path / "run"), weights_of(source)
-    assert_near(after["left"], before["left"])
-    assert differ(after["selector"], before["selector"])
-
-
-def test_what_is_wrong_with_several_runs_is_a_sentence(source, other_runs, tmp_path):
+def test_what_is_wrong_with_several_runs_is_a_sentence_and_populations_start_from_none(
+    source, other_runs, tmp_path
+):
+    evolve = {"selector": Evolution(population=2, generations=2)}
+    with pytest.raises(SkillweaveError, match=r"start_from: stage 'selector' evolves"):
+        declare().train(tmp_path / "run", quiet=True, evolve=evolve, start_from=source)
     _, plain = other_runs
     for start, says in (
         ({}, r"start_from is \{\}; name the run of each"),
@@ -399,46 +388,39 @@ def test_what_is_wrong_with_several_runs_is_a_sentence(source, other_runs, tmp_p
     ):
         with pytest.raises(SkillweaveError, match=says):
             train(tmp_path / "run", start)
+    assert not (tmp_path / "run").exists()
     train(tmp_path / "less", None, skills=(Left, Push))
     with pytest.raises(RunError, match=r"'other' has not learnt in .*; there learnt left, s"):
         train(tmp_path / "run", {"other": tmp_path / "less"})
 
 
-@pytest.fixture
-def train_from(tmp_path):
-    """The command that trains a run from others; it returns the exit code."""
+def test_the_command_takes_one_run_or_several(source, other_runs, tmp_path, capsys):
     recipe = tmp_path / "cart.py"
     recipe.write_text("from test_start_from import declare\nhierarchy = declare(rate=1e-12)\n")
 
-    def command(*runs):
+    def train_from(*runs, out="run"):
         words = [word for run in runs for word in ("--start-from", str(run))]
-        return main(
-            ["train", str(recipe), "--out", str(tmp_path / "run"), "--evaluate", "0", *words]
-        )
+        to = ["--out", str(tmp_path / out), "--evaluate", "0"]
+        return main(["train", str(recipe), *to, *words]), capsys.readouterr().err
 
-    return command
-
-
-def test_the_command_takes_several_runs(source, other_runs, tmp_path, capsys, train_from):
-    assert train_from(f"left={source}", f"other={other_runs[0]}") == 0
-    after = weights_of(tmp_path / "run")
-    assert_near(after["left"], weights_of(source)["left"])
+    assert train_from(f"left={source}", f"other={other_runs[0]}")[0] == 0
+    before, after = weights_of(source), weights_of(tmp_path / "run")
+    assert_near(after["left"], before["left"])
     assert_near(after["other"], weights_of(other_runs[0])["other"])
-    assert train_from(source, f"left={source}") == 1
-    assert "name the learner of each" in capsys.readouterr().err
-    assert train_from(f"left={source}", f"left={source}") == 1
-    assert "names left twice" in capsys.readouterr().err
-
-
-def test_the_command_takes_a_run(source, tmp_path, capsys, train_from):
-    assert train_from(source) == 0
-    assert "start from" in capsys.readouterr().err
-    assert main(["info", str(tmp_path / "run")]) == 0
+    assert differ(after["selector"], before["selector"]), "who is not named begins afresh"
+    code, said = train_from(source, out="second")
+    assert (code, "start from" in said) == (0, True)
+    assert_near(weights_of(tmp_path / "second")["selector"], before["selector"])
+    assert main(["info", str(tmp_path / "second")]) == 0
     run = manifest_of(source).id
     assert f"left starts from run {run}, after 320 steps there" in capsys.readouterr().out
-    assert_near(weights_of(tmp_path / "run")["selector"], weights_of(source)["selector"])
-    assert train_from(tmp_path / "no") == 1
-    assert "holds no run" in capsys.readouterr().err
+    for runs, says in (
+        ((source, f"left={source}"), "name the learner of each"),
+        ((f"left={source}", f"left={source}"), "names left twice"),
+        ((tmp_path / "no",), "holds no run"),
+    ):
+        code, said = train_from(*runs, out="third")
+        assert (code, says in said) == (1, True)
 
 
 def nested(rate=None):

@@ -49,12 +49,6 @@ def reference(tmp_path_factory):
     return Agent(WARM, ON, STEPS).train(tmp_path_factory.mktemp("r") / "run", quiet=True).path
 
 
-def test_controls_are_escaped_and_words_stay():
-    assert printable("größer → 5 ± 1\n\tnext") == "größer → 5 ± 1\n\tnext"
-    assert printable("\x1b[2J\r\x9b\u202e\x7f") == "\\x1b[2J\\x0d\\x9b\\u202e\\x7f"
-    assert one_line("a\nfinished: all good") == "a\\nfinished: all good"
-
-
 # Closed, full and missing streams
 
 
@@ -244,9 +238,14 @@ def test_commands_print_a_strangers_run_escaped(commands, evil, capfd, monkeypat
         assert not [raw for raw in RAW if raw in out + err], words
     main(["info", run])
     assert "\\nrun  /etc" in capfd.readouterr().out
+    main(["info", run, "--json"])
+    assert json.loads(capfd.readouterr().out)["env"] == EVIL
 
 
-def test_errors_and_descriptions_are_escaped():
+def test_controls_are_escaped_in_errors_and_descriptions_and_words_stay():
+    assert printable("größer → 5 ± 1\n\tnext") == "größer → 5 ± 1\n\tnext"
+    assert printable("\x1b[2J\r\x9b\u202e\x7f") == "\\x1b[2J\\x0d\\x9b\\u202e\\x7f"
+    assert one_line("a\nfinished: all good") == "a\\nfinished: all good"
     error = SkillweaveError(f"no environment {EVIL}")
     assert not [raw for raw in RAW if raw in str(error)]
     named = Agent(WARM, ON, STEPS)
@@ -255,11 +254,6 @@ def test_errors_and_descriptions_are_escaped():
         assert not [raw for raw in RAW if raw in repr(named) + str(named)]
     finally:
         warm.__name__ = warm.__qualname__ = "warm"
-
-
-def test_json_stays_json(evil, capsys):
-    assert main(["info", str(evil), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["env"] == EVIL
 
 
 def test_progress_of_a_metric_with_a_hostile_name_is_escaped(tmp_path, capsys):
@@ -277,14 +271,6 @@ def test_progress_of_a_metric_with_a_hostile_name_is_escaped(tmp_path, capsys):
 
 
 # A locale of ASCII
-
-
-@pytest.mark.parametrize("words", [["list"], ["info", "lunar-lander"]])
-def test_results_where_the_encoding_knows_ascii_alone(words, monkeypatch):
-    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
-    with monkeypatch.context() as patch:
-        patch.setattr(sys, "stdout", out)
-        assert main(words) == 0
 
 
 @pytest.mark.slow
@@ -340,7 +326,9 @@ def test_texts_that_users_may_print_are_ascii():
     assert wrong == []
 
 
-def test_results_and_errors_can_be_printed_where_the_encoding_knows_ascii_alone(tmp_path):
+def test_results_and_errors_can_be_printed_where_the_encoding_knows_ascii_alone(
+    tmp_path, monkeypatch
+):
     trained = Hierarchy(WARM, [Left()], algorithm=ON, selector=ON, steps=STEPS).train(
         tmp_path / "run", quiet=True
     )
@@ -353,3 +341,5 @@ def test_results_and_errors_can_be_printed_where_the_encoding_knows_ascii_alone(
             print(made, repr(made), file=out)
         for made in (trained.calls.chain("left", "left"), trained.info(), caught.value):
             print(made, file=out)
+        monkeypatch.setattr(sys, "stdout", out)
+        assert [main(words) for words in (["list"], ["info", "lunar-lander"])] == [0, 0]

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from declaring import Other, declare
 from small_runs import (
     MEMORY,
     OFF,
@@ -26,7 +27,6 @@ from small_runs import (
     reports_every,
     stage_entry,
 )
-from together_runs import Other, declare
 
 from skillweave import SAC, EnvSpec, Lengths, Skill, SkillweaveError, Together
 from skillweave.algorithms.agent_policy import make_algorithm
@@ -349,7 +349,15 @@ def test_a_run_says_what_nobody_said_where_it_makes_a_difference(tmp_path, learn
     run.close()
 
 
-def test_the_critic_knows_how_many_calls_the_selector_draws_by_lot():
+def test_the_critic_learns_as_the_selector_decides_and_what_deciding_is_worth_where_calls_are_cut():
+    for learn in ("together", "apart", "apart, then together"):
+        *_, stage = declare(learn=learn, interrupt=True).stages()
+        assert stage.beside["skill_critic"].deciding
+    (stage,) = declare(together=Together(task_weight=0.5)).stages()
+    assert not stage.beside["skill_critic"].deciding
+    selector = replace(ON, min_advantage_std=7.0)
+    (stage,) = declare(interrupt=True, selector=selector).stages()
+    assert stage.beside["skill_critic"].min_advantage_std == 7.0
     for how in ({}, {"selector": replace(ON, epsilon=0.7)}):
         told = Together(epsilon_fraction=0.3, task_weight=0.0)
         (stage,) = declare(interrupt=True, together=told, **how).stages()
@@ -368,20 +376,6 @@ def test_how_a_selectors_floor_falls_is_not_lost_where_it_has_none(name):
     assert getattr(stage.config, name) == 0.5
     assert stage.config.epsilon == 0.7
     declare(learn="apart", selector=replace(ON, **{name: 0.5})).stages()
-
-
-def test_the_critic_learns_what_deciding_is_worth_where_calls_are_cut():
-    for learn in ("together", "apart", "apart, then together"):
-        *_, stage = declare(learn=learn, interrupt=True).stages()
-        assert stage.beside["skill_critic"].deciding
-    (stage,) = declare(together=Together(task_weight=0.5)).stages()
-    assert not stage.beside["skill_critic"].deciding
-
-
-def test_the_critic_divides_advantages_by_as_much_as_the_selector_does():
-    selector = replace(ON, min_advantage_std=7.0)
-    (stage,) = declare(interrupt=True, selector=selector).stages()
-    assert stage.beside["skill_critic"].min_advantage_std == 7.0
 
 
 class Never(Left):
@@ -434,19 +428,16 @@ def test_success_is_judged_by_all_calls_of_a_stage_and_its_rate_by_the_last(
     run, log = skill_log
     for update, metrics in enumerate(told):
         log.tick(update, 64 * (update + 1), 0.1, metrics)
+    for other in (1.0, True, None):  # lines that name no stage
+        run.log({"success": other})
     log.done({}, {})
     entry = RunDirectory.open(run.path).stage("left")
     assert entry.succeeded is succeeded
     assert success_rate(entry) == rate
 
 
-def test_lines_that_name_no_stage_say_nothing_of_success_and_words_are_refused(skill_log):
+def test_words_instead_of_a_rate_of_success_are_refused(skill_log):
     run, log = skill_log
-    log.tick(0, 64, 0.1, {"success": 0.0})
-    for other in (1.0, True, None):
-        run.log({"success": other})
-    log.done({}, {})
-    assert run.stage("left").succeeded is False
     run.log({"stage": "left", "success": "often"})
     with pytest.raises(SkillweaveError, match=r"metrics\.jsonl: 'left' has .* 'often', .* resume"):
         log.done({}, {})
@@ -470,22 +461,19 @@ def test_with_one_skill_and_calls_of_one_step_no_trajectory_is_torn(tmp_path):
     assert found["length"] > 15
 
 
-@pytest.mark.parametrize("steps", [(), (0, 4), (4, 2), (1, 2.5), (..., 4), (1, ...)])
-def test_wrong_lengths_are_told(steps):
-    with pytest.raises(SkillweaveError, match="Lengths"):
-        Lengths(*steps)
+def test_who_would_never_learn_and_who_cannot_evolve_is_told_before_a_run_is_begun(tmp_path):
+    with pytest.raises(SkillweaveError, match="budget is 15 steps, but 'other' begins to learn"):
+        declare(Left(), Other(), together_steps=15).train(tmp_path / "run", quiet=True)
+    last = declare(learn="apart, then together")
+    with pytest.raises(SkillweaveError, match="stage 'together': selector and left"):
+        last.train(tmp_path / "run", quiet=True, evolve=Evolution(population=2))
+    assert not (tmp_path / "run").exists()
 
 
 def test_lengths_double_where_dots_stand():
     assert Lengths(1, ..., 16).steps == (1, 2, 4, 8, 16)
     assert Lengths(3, ..., 10, 40).steps == (3, 6, 10, 40)
     assert repr(Lengths(1, 4)) == "Lengths(1, 4)"
-
-
-def test_a_skill_that_would_never_learn_is_told(tmp_path):
-    with pytest.raises(SkillweaveError, match="budget is 15 steps, but 'other' begins to learn"):
-        declare(Left(), Other(), together_steps=15).train(tmp_path / "run", quiet=True)
-    assert not (tmp_path / "run").exists()
 
 
 def test_a_stage_ends_early_at_its_target(tmp_path):
@@ -508,12 +496,6 @@ def test_what_cannot_evolve_together_learns_apart_and_says_so_once(tmp_path, cap
     assert [s["name"] for s in run.info()["stages"]] == ["left", "selector"]
     assert hierarchy.learn == "together", "the declaration stays as it was"
     assert len(hierarchy.load(run.path).evaluate(2).returns) == 2
-
-
-def test_what_is_asked_to_learn_together_at_last_does_not_evolve(tmp_path):
-    hierarchy = declare(learn="apart, then together")
-    with pytest.raises(SkillweaveError, match="stage 'together': selector and left"):
-        hierarchy.train(tmp_path / "run", quiet=True, evolve=Evolution(population=2))
 
 
 @pytest.mark.slow

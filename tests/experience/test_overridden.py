@@ -78,7 +78,7 @@ def test_rows_of_skills_that_learn_under_a_selector():
 
 
 def test_reflexes_are_in_force_while_skills_learn():
-    from together_runs import declare
+    from declaring import declare
 
     hierarchy = declare(reflexes=[BACK])
     (stage,) = hierarchy.stages()

@@ -47,11 +47,6 @@ def test_it_is_said_once_in_a_run(learn, workers, capsys):
     assert said(capsys) == 1
 
 
-def test_a_quiet_run_says_it_as_a_python_warning():
-    with pytest.warns(UserWarning, match="steps without an end"):
-        sw.train_agent(sw.EnvSpec(Endless, workers=1), SMALL, 400, quiet=True)
-
-
 @pytest.mark.parametrize(
     "spec",
     [
@@ -66,7 +61,8 @@ def test_a_limit_of_any_kind_counts(spec, capsys):
 
 
 def test_evaluations_have_a_limit_of_their_own():
-    run = sw.train_agent(sw.EnvSpec(Endless, workers=1), SMALL, 128, quiet=True)
+    with pytest.warns(UserWarning, match="steps without an end"):  # a quiet run says it so
+        run = sw.train_agent(sw.EnvSpec(Endless, workers=1), SMALL, 400, quiet=True)
     found = run.evaluate(3)
     assert (found.lengths, found.cut) == ((100,) * 3, 3)
     assert "3 never ended and were cut after 100 steps (max_steps)" in str(found)
@@ -99,12 +95,9 @@ def test_an_evaluation_with_a_limit_or_ends_says_nothing(monkeypatch):
     assert sw.evaluate(policy, Endless, episodes=1, max_steps=80).lengths == (80,)
     assert sw.evaluate(policy, limited, episodes=1).lengths == (80,)
     assert sw.evaluate(policy, Limited, episodes=1).lengths == (50,)
-
-
-def test_a_longer_limit_that_is_known_is_kept():
-    policy = sw.from_function(lambda obs: np.zeros(len(obs), int))
-    spec = sw.EnvSpec(Endless, wrappers=(lambda e: gym.wrappers.TimeLimit(e, 300),))
-    assert sw.evaluate(policy, spec, episodes=2).lengths == (300, 300)
+    longer = sw.EnvSpec(Endless, wrappers=(lambda e: gym.wrappers.TimeLimit(e, 300),))
+    monkeypatch.undo()
+    assert sw.evaluate(policy, longer, episodes=2).lengths == (300, 300)
 
 
 def test_evaluations_that_take_longer_than_training_are_said_once(capsys, monkeypatch):

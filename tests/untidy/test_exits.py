@@ -46,18 +46,21 @@ def skill(**methods):
     return type("Leaves", (sw.Skill,), {"name": "leaves", "max_steps": 4, **methods})()
 
 
-SKILLS = {
-    **{method: {method: leave} for method in ("reward", "initiation", "termination", "success")},
-    "policy": {"policy": leave},
-}
+METHODS = ("reward", "initiation", "termination", "success", "policy")
 
 
-@pytest.mark.parametrize("learn", ["together", "apart"])
-@pytest.mark.parametrize("methods", SKILLS.values(), ids=SKILLS)
-def test_in_a_function_of_a_skill(methods, learn):
+@pytest.mark.parametrize(
+    ("method", "learn"), [*((method, "together") for method in METHODS), ("reward", "apart")]
+)
+def test_in_a_function_of_a_skill(method, learn):
     with pytest.raises(sw.SkillweaveError) as found:
         sw.Hierarchy(
-            Ramp, [skill(**methods), Stay()], algorithm=SMALL, selector=SMALL, steps=64, learn=learn
+            Ramp,
+            [skill(**{method: leave}), Stay()],
+            algorithm=SMALL,
+            selector=SMALL,
+            steps=64,
+            learn=learn,
         ).train(quiet=True)
     assert found.match("skill 'leaves'")
     assert found.match(r"(?s).* raised" + WHERE)
@@ -90,7 +93,7 @@ AROUND = {
 
 
 @pytest.mark.parametrize("how", AROUND.values(), ids=AROUND)
-def test_in_a_function_of_a_hierarchy(how):
+def test_in_a_function_of_a_hierarchy_and_in_a_policy_that_is_evaluated(how):
     settings = {"algorithm": SMALL, "selector": SMALL, "steps": 64}
 
     def train():
@@ -99,8 +102,5 @@ def test_in_a_function_of_a_hierarchy(how):
 
     with pytest.raises(sw.SkillweaveError, match=r"raised" + WHERE):
         train()
-
-
-def test_in_a_policy_that_is_evaluated():
     with pytest.raises(PolicyError, match=r"raised" + WHERE):
         sw.evaluate(sw.from_function(leave), Ramp, episodes=1)

@@ -84,17 +84,42 @@ def test_a_simulator_of_which_there_can_be_one_works_in_every_mode(learn, tmp_pa
     assert (Counted.most, Counted.alive) == (1, 0)
 
 
-def test_more_than_can_be_made_names_the_setting():
-    Counted.allowed = 3
-    with pytest.raises(EnvError, match=r"3 could be made.*num_envs=3"):
-        hierarchy("together", 8).train(quiet=True)
-    assert (Counted.begun, Counted.alive) == (0, 0)
+def agent(num_envs: int) -> sw.Agent:
+    return sw.Agent(sw.EnvSpec(Counted, workers=1), small(num_envs), 600)
 
 
-def test_where_two_are_needed_one_is_refused_before_anything_is_trained():
-    Counted.allowed = 1
-    with pytest.raises(EnvError, match=r"port 2000 is in use.*leave eval_every out"):
-        hierarchy("apart", 1).train(eval_every=200, quiet=True)
+ONE = r"port 2000 is in use.*A population needs several environments at once, here 3 of them"
+REFUSED = {
+    "training": (3, lambda: hierarchy("together", 8), {}, r"3 could be made.*num_envs=3"),
+    "evaluating": (
+        1,
+        lambda: hierarchy("apart", 1),
+        {"eval_every": 200},
+        r"port 2000 is in use.*leave eval_every out",
+    ),
+    "agents": (1, lambda: agent(1), {"evolve": {"agent": Evolution(population=3)}}, ONE),
+    "selectors": (
+        1,
+        lambda: hierarchy("apart", 1),
+        {"evolve": {"selector": Evolution(population=3)}},
+        ONE,
+    ),
+    "a population": (
+        4,
+        lambda: agent(2),
+        {"evolve": Evolution(population=4, episodes=3)},
+        r"here 8 of them to train in.*\(population\) and num",
+    ),
+}
+
+
+@pytest.mark.parametrize(("allowed", "declare", "how", "says"), REFUSED.values(), ids=REFUSED)
+def test_more_than_can_be_made_is_refused_at_once_with_the_setting(
+    allowed, declare, how, says, tmp_path
+):
+    Counted.allowed = allowed
+    with pytest.raises(EnvError, match=says):
+        declare().train(tmp_path / "run", quiet=True, **how)
     assert (Counted.begun, Counted.alive) == (0, 0)
 
 
@@ -128,7 +153,7 @@ class Starts(Counted):
 def test_members_of_a_population_are_compared_in_no_more_than_they_train_in():
     """Seven episodes: the same starts for all members, in any number of environments."""
     found = []
-    for n in (1, 2, 16):
+    for n in (1, 2, 8):
         Counted.alive = Counted.most = 0
         spec = sw.EnvSpec(Starts, engine="sync", workers=1)
         how = Evolution(population=2, generations=2, episodes=7)
@@ -140,29 +165,6 @@ def test_members_of_a_population_are_compared_in_no_more_than_they_train_in():
     assert found[0] == found[1] == found[2]
     assert found[0][0] == found[0][1]
     assert found[0][0] != found[0][2]
-
-
-@pytest.mark.parametrize("stage", ["agent", "selector"])
-def test_a_population_of_a_simulator_of_which_there_can_be_one_is_refused_at_once(stage, tmp_path):
-    Counted.allowed = 1
-    search = Evolution(population=3)
-    says = r"port 2000 is in use.*A population needs several environments at once, here 3 of them"
-    agent = sw.Agent(sw.EnvSpec(Counted, workers=1), small(1), 600)
-    declared = agent if stage == "agent" else hierarchy("apart", 1)
-    with pytest.raises(EnvError, match=says):
-        declared.train(tmp_path / "run", evolve={stage: search}, quiet=True)
-    assert (Counted.begun, Counted.alive) == (0, 0)
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_population_that_needs_more_than_can_be_made_names_its_settings():
-    Counted.allowed = 4
-    with pytest.raises(EnvError, match=r"here 8 of them to train in.*\(population\) and num"):
-        sw.train_agent(
-            sw.EnvSpec(Counted, workers=1), small(2), 600, quiet=True,
-            evolve=Evolution(population=4, episodes=3),
-        )  # fmt: skip
-    assert (Counted.begun, Counted.alive) == (0, 0)
 
 
 @pytest.mark.slow

@@ -206,12 +206,3 @@ def test_forbidden_actions_are_not_tried_either_to_measure_speed(where):
             return super().step(action)
 
     sw.train_agent(lambda: Strict(where), SMALL, 64, quiet=True)
-
-
-def test_a_method_that_fails_is_named():
-    class Broken(Slots):
-        def action_masks(self):
-            raise ValueError("no board")
-
-    with pytest.raises(EnvError, match=r"action_masks\(\) raised ValueError: no board"):
-        sw.train_agent(sw.EnvSpec(lambda: Broken("none"), workers=1), SMALL, 256, quiet=True)

@@ -17,7 +17,7 @@ import pytest
 from living import all_end
 from reference_calls import EPISODE
 from toy_acting import Again, Choices, Mortal, deciding, equal, requests, stepping
-from toys import alone_in
+from toys import World, alone_in
 
 from skillweave._internal import parent_process
 from skillweave._internal.seeding import Seeds
@@ -193,6 +193,8 @@ def test_a_state_goes_from_processes_to_this_thread_and_back(in_processes):
         apart.collect(request)
     state = apart.state()
     assert not len(plain.restore({k: np.array(v) for k, v in state.items()}))
+    with pytest.raises(SkillweaveError, match="of 2 collectors, but there are 1"):
+        Collectors([deciding()(6, 0)]).restore(state)
     again = in_processes(deciding())
     again.restore(state)
     for request in itertools.islice(asked, 5):
@@ -201,58 +203,20 @@ def test_a_state_goes_from_processes_to_this_thread_and_back(in_processes):
         same(again.collect(request), found)
 
 
-def test_a_state_of_another_number_of_collectors_is_refused(in_processes):
-    apart = in_processes(deciding())
-    apart.start(Seeds(0))
-    with pytest.raises(SkillweaveError, match="of 2 collectors, but there are 1"):
-        Collectors([deciding()(6, 0)]).restore(apart.state())
-
-
-class Stuck(Again):
-    def step(self, action):
-        time.sleep(60)
-
-
-def test_closing_ends_workers_that_are_stuck(in_processes):
-    collectors = in_processes(stepping(Stuck))
-    collectors.start(Seeds(0))
-    collectors._workers[0].send("collect", next(requests(5)))
-    workers = [w.process for w in collectors._workers]
-    collectors.close()
-    assert not any(w.is_alive() for w in workers)
-
-
-def test_environments_that_cannot_be_shared_out_equally_are_refused():
+def test_one_worker_is_this_thread_and_environments_are_shared_out_equally():
+    assert type(make_collectors(stepping(), 4, 1, 1, "Walk")) is Collectors
     with pytest.raises(SkillweaveError, match="must be a multiple of workers, 3"):
         make_collectors(stepping(), 8, 3, 1, "Walk")
 
 
-def test_one_worker_is_this_thread():
-    assert type(make_collectors(stepping(), 4, 1, 1, "Walk")) is Collectors
-
-
-class Wide(gym.Env):
-    """Its observations are large: they grow out of the first block of shared memory."""
-
-    observation_space = gym.spaces.Box(0, 255, (50, 50, 3), np.uint8)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self._look(), {}
-
-    def _look(self):
-        return np.full((50, 50, 3), self.t, np.uint8)
-
-    def step(self, action):
-        self.t += 1
-        return self._look(), 1.0, self.t >= 9, False, {}
-
-
 def test_large_columns_come_whole_though_the_memory_must_grow(in_processes):
+    """They grow out of the first block of shared memory."""
+
+    def wide():
+        return World(gym.spaces.Box(0, 255, (50, 50, 3), np.uint8))
+
     def make(num_envs, first):
-        engine = make_engine(EnvSpec(Wide, engine="sync"), num_envs, first=first)
+        engine = make_engine(EnvSpec(wide, engine="sync"), num_envs, first=first)
         return alone_in(engine, Choices(num_envs, 2))
 
     plain, apart = here(make), in_processes(make)

@@ -255,17 +255,3 @@ def test_an_address_where_nobody_listens_is_told_at_once(monkeypatch, address, s
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     with pytest.raises(SkillweaveError, match=says), Ray(address=address).connected(1, print):
         pass
-
-
-@pytest.mark.parametrize(
-    ("how", "says"),
-    [
-        ({"collectors": 0}, "collectors is 0"),
-        ({"address": 6379}, "address is 6379"),
-        ({"cpus": 0}, "cpus is 0"),
-        ({"patience": -1}, "patience is -1"),
-    ],
-)
-def test_settings_out_of_range_are_refused(how, says):
-    with pytest.raises(SkillweaveError, match=says):
-        Ray(**how)
