@@ -64,12 +64,6 @@ def test_a_stack_of_it_learns_what_its_members_learn_alone():
 # From end to end
 
 
-def test_it_trains_a_plain_agent(tmp_path):
-    config = own(num_envs=4, n_steps=16)
-    run = train_agent("CartPole-v1", config, 512, tmp_path / "run", quiet=True)
-    assert run.evaluate(2).mean > 0
-
-
 def test_it_trains_skills_selectors_and_populations(tmp_path):
     config = own(num_envs=4, n_steps=16)
     hierarchy = Hierarchy(
@@ -173,15 +167,10 @@ MISTAKES = {
         ),
         "PPO is an algorithm of this library",
     ),
-    "a space of bits": (
-        lambda: make_algorithm(own(), BOX, gym.spaces.MultiBinary(2)),
-        "A2C cannot act in MultiBinary.*; PPO, SelfImitationPPO can",
-    ),
     "a discrete space": (
         lambda: make_algorithm((own(), named_config("TD3", "here"))[1], BOX, LINE),
         "TD3 cannot .*Discrete.*; PPO, SelfImitationPPO, DQN, SAC, A2C",
     ),
-    "a common setting": (lambda: own(gamma=2.0), r"A2C\.gamma is 2"),
 }
 
 

@@ -12,7 +12,6 @@ from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import SelfImitationPPO
 from skillweave.algorithms.batches import Rollout
 from skillweave.algorithms.registry import make_algorithm
-from skillweave.errors import DeclarationError
 
 SEEN, THREE = Box(-1.0, 1.0, (2,), np.float32), Discrete(3)
 CONFIG = SelfImitationPPO(
@@ -170,10 +169,3 @@ def test_a_few_rows_are_not_learnt_by_heart(batch, most, steps):
     algorithm.keep(state, rollout([[0.0, 0.0, 0.0, 3.0]], ends=[(3, 0)]))
     algorithm.imitate(state, state.learning_rate, rngs())
     assert state.count.tolist() == [steps]
-
-
-def test_memory_is_refused():
-    from skillweave.algorithms import RNN
-
-    with pytest.raises(DeclarationError, match=r"SelfImitationPPO\.network .* without rnn"):
-        SelfImitationPPO(network=Network(rnn=RNN("gru", 4)))
