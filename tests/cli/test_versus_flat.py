@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli.test_cli import PLAIN
+from cli.plain_recipe import PLAIN
 
 from skillweave.cli import main, training_commands
 from skillweave.cli.training_commands import _verdict
@@ -64,15 +64,3 @@ def test_what_the_hierarchy_scored_is_told_before_the_flat_agent_is_trained(
     asked = ["train", str(tmp_path / "plain.py"), "-o", str(tmp_path / "run"), "--versus-flat"]
     assert main([*asked, "--quiet", "--evaluate", "4"]) == 130
     assert "over 4 episodes" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("more", "words"), [(["--flat"], "leave out"), (["--evaluate", "0"], "at least 1")]
-)
-def test_what_makes_no_comparison_is_refused(
-    more: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    asked = ["train", "lunar-lander", "-o", str(tmp_path / "run"), "--versus-flat", *more]
-    assert main(asked) == 1
-    assert words in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()

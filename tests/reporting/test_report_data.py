@@ -253,9 +253,3 @@ def test_without_the_recipe_the_report_says_so_and_shows_the_rest(folder, tmp_pa
     assert report(capsys, coded, "-o", out, "--recipe", recipe)["missing"] == []
     assert "&lt;catch&gt;" in out.read_text()
     assert "<catch>" not in out.read_text()
-
-
-def test_errors_are_plain(tmp_path, capsys):
-    for words in (["report", str(tmp_path)], ["compare", str(tmp_path)]):
-        assert main(words) == 1
-        assert f"{tmp_path} holds no run" in capsys.readouterr().err
