@@ -141,14 +141,10 @@ def test_a_td3_checkpoint_has_its_critics(tmp_path):
         torch.testing.assert_close(found[0, i], want)
 
 
-def test_load_refuses_a_pickle_and_says_what_to_do(tmp_path):
+def test_without_trust_a_pickle_is_not_read(tmp_path, capsys):
     ppo_file(tmp_path / "old.pt")
     with pytest.raises(RunError, match=r"import-agilerl .*old\.pt --trust"):
         PPO.load(tmp_path / "old.pt")
-
-
-def test_without_trust_nothing_is_read(tmp_path, capsys):
-    ppo_file(tmp_path / "old.pt")
     assert command(tmp_path / "old.pt") == 1
     assert "--trust" in capsys.readouterr().err
     assert not (tmp_path / "old.safetensors").exists()
