@@ -112,8 +112,11 @@ def test_an_algorithm_of_the_users_own_that_does_not_follow_schedules_refuses_th
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("how", [Linear(2e-3, 5e-4), halving, lambda remaining: 2e-3 * remaining])
-@pytest.mark.parametrize("config", [ON, OFF], ids=["ppo", "dqn"])
+@pytest.mark.parametrize(
+    ("config", "how"),
+    [(ON, Linear(2e-3, 5e-4)), (ON, halving), (OFF, lambda remaining: 2e-3 * remaining)],
+    ids=["ppo, a line", "ppo, a function", "dqn, a function without a name"],
+)
 def test_a_stopped_run_has_the_same_rates_as_one_that_was_not(tmp_path, config, how):
     def declare() -> Hierarchy:
         changed = replace(config, learning_rate=how)

@@ -164,7 +164,7 @@ def test_the_best_so_far_must_hold_its_own_on_the_same_episodes(tmp_path, monkey
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", ["ppo", "rainbow", "sac"])
 def test_a_killed_population_ends_with_the_very_same_weights(name, tmp_path, monkeypatch):
     whole = train(name, tmp_path / "whole", seed=3)
     for generation in (0, 2):
@@ -187,12 +187,11 @@ def test_a_killed_population_ends_with_the_very_same_weights(name, tmp_path, mon
 
 
 RECURRENT = PPO(num_envs=2, n_steps=16, batch_size=16, network=Network((6,), rnn=RNN("gru", 4)))
-SCALED = DQN(**REPLAY, normalize_rewards=True)
-SCALED_RAINBOW = DQN.rainbow(**REPLAY, normalize_obs=True)
+SCALED_RAINBOW = DQN.rainbow(**REPLAY, normalize_obs=True, normalize_rewards=True)
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("config", [CONFIGS["ppo"], RECURRENT, SCALED, SCALED_RAINBOW])
+@pytest.mark.parametrize("config", [CONFIGS["ppo"], RECURRENT, SCALED_RAINBOW])
 def test_a_killed_population_of_selectors_ends_with_the_very_same_weights(
     config, tmp_path, monkeypatch
 ):
@@ -259,7 +258,7 @@ def test_fitness_is_measured_on_the_same_starts_for_all(tmp_path):
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", ["ppo", "td3"])
 def test_a_member_that_diverges_is_reported_and_replaced(name, tmp_path, monkeypatch):
     poisoned: list[int] = []
     trained = Population.train
@@ -286,7 +285,7 @@ def test_a_member_that_diverges_is_reported_and_replaced(name, tmp_path, monkeyp
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", ["ppo", "dqn", "sac"])
 def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tmp_path):
     config = replace(CONFIGS[name], max_grad_norm=1e30)
     learning_task = skill_task(agent_role(spec(name)))
