@@ -182,10 +182,13 @@ def test_gif_holds_every_frame(tmp_path):
             video.add(frame)
         video.add(frame)  # unchanged
         video.add(frame, seconds=1.5)
-    frames, durations = decode(path)
-    assert len(frames) == video.frames == 14
+        video.add(np.full_like(frame, (200, 40, 90)))  # a colour that the first frame lacked
+    *frames, last = decode(path)[0]
+    assert len(frames) + 1 == video.frames == 15
     for got, wanted in zip(frames, [*written, frame, frame], strict=True):
         assert np.abs(got.astype(int) - wanted).max() <= 4
+    assert np.abs(last.astype(int) - (200, 40, 90)).max() <= 32
+    durations = decode(path)[1][:-1]
     assert durations[-1] == 1500
     assert abs(sum(durations[:-1]) - 13 * 1000 / 30) <= 10
 
