@@ -11,10 +11,10 @@ from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from declaring import plainly
+from line_world import TINY, Line
 
 from benchmarks.pay import __main__ as command, agents
 from benchmarks.pay.agents import CHAINS, FLAT, HIERARCHY, SHAPED, TUNED, TUNING_SEED, Bench
@@ -30,35 +30,9 @@ from benchmarks.pay.results import (
     read,
 )
 from benchmarks.pay.suite import Seldom, Shaped, Suite, Task
-from skillweave import PPO, EnvSpec, Hierarchy, Network, Run, Skill, SkillweaveError, Step
+from skillweave import EnvSpec, Hierarchy, Run, Skill, SkillweaveError, Step
 from skillweave.hierarchy import select_best
 from skillweave.types import Evaluation
-
-TINY = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
-
-
-class Line(gym.Env):
-    """Places −3 to 3; the end of one side pays 1."""
-
-    observation_space = gym.spaces.Box(-3.0, 3.0, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def __init__(self, goal=3):
-        self.goal = goal
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.place, self.steps = 0, 0
-        return self._obs(), {}
-
-    def step(self, action):
-        self.steps += 1
-        self.place = int(np.clip(self.place + 2 * action - 1, -3, 3))
-        there = self.place == self.goal
-        return self._obs(), float(there), there, self.steps == 12 and not there, {}
-
-    def _obs(self):
-        return np.array([self.place], np.float32)
 
 
 class Right(Skill):

@@ -235,8 +235,7 @@ def test_without_the_recipe_the_report_says_so_and_shows_the_rest(folder, tmp_pa
     coded = tmp_path / "coded"
     recipe = tmp_path / "coded.py"
     reflex = '    reflexes=[Reflex(lambda obs: obs[:, 2] > 0.1, action=1, name="<catch>")],\n'
-    text = RECIPE.replace("import PPO", "import Reflex, PPO")
-    recipe.write_text(text.replace("    call_steps=5", reflex + "    call_steps=5"))
+    recipe.write_text(RECIPE.replace("    call_steps=5", reflex + "    call_steps=5"))
     train = ["train", recipe, "--quiet", "--evaluate", "2", "-o", coded, "--scale", "0.1"]
     assert main([str(w) for w in train]) == 0
     capsys.readouterr()

@@ -133,6 +133,8 @@ def test_without_a_network_a_run_is_loaded_as_it_was_downloaded(run, hub, tmp_pa
     go_to(NOWHERE, tmp_path / "empty", monkeypatch)
     with pytest.raises(RunError, match=r"cannot be reached.*no copy of ada/cart.*ConnectError"):
         sw.from_hub(NAME)
+    with pytest.raises(RunError, match=r"cannot be reached\. Nothing was pushed"):
+        run.push(NAME)
 
 
 # What is not loaded
@@ -231,12 +233,6 @@ def test_where_the_hub_fails_nothing_is_half_pushed(run, hub):
     hub.breaks_at = ""
     run.push(NAME)
     assert same_actions(sw.from_hub(NAME), run)
-
-
-def test_no_network_is_told(run, tmp_path, monkeypatch):
-    go_to(NOWHERE, tmp_path / "cache", monkeypatch)
-    with pytest.raises(RunError, match=r"cannot be reached\. Nothing was pushed"):
-        run.push(NAME)
 
 
 def test_a_missing_library_names_its_extra(run, monkeypatch):
