@@ -43,6 +43,8 @@ def test_both_are_trained_on_as_many_steps_and_compared(
     found = json.loads(capsys.readouterr().out)
     (flat,) = found["flat"]["stages"]
     assert flat["budget"] == sum(s["budget"] for s in found["stages"])
+    assert flat["budget"] <= flat["steps"] < flat["budget"] + 64  # of whole rollouts
+    assert "hierarchy" not in found["flat"]
     assert found["flat"]["run"] == str(tmp_path / "run-flat")
     assert {found["evaluation"]["episodes"], found["flat"]["evaluation"]["episodes"]} == {4}
     assert main([*common, "--quiet"]) == 1, "the run is there already"

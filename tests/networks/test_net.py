@@ -104,11 +104,7 @@ def test_noisy_weights_are_means_and_scaled_factorised_noise():
                 found[f"{layer}.bias"][m, 0], bias + spread[1] * torch.tensor(own[n_in:])
             )
 
-
-def test_without_noise_the_means_act():
-    net, layout, flat = noisy_net()
-    views = layout.views(flat)
-    still = net.perturbed(views, torch.zeros(P, net.noise_size))
+    still = net.perturbed(views, torch.zeros(P, net.noise_size))  # the means act
     assert torch.equal(net(still, inputs()), net(views, inputs()))
     plain = {k: v for k, v in views.items() if "sigma" not in k}
     assert torch.equal(net(plain, inputs()), net(views, inputs()))
