@@ -156,9 +156,16 @@ def test_what_is_there_is_not_run_again(done, monkeypatch):
     assert {r.task + r.agent: r for r in done.all("line")} == before
 
 
-def test_a_result_of_other_budgets_is_not_taken_for_this_one(done):
+def test_a_result_of_other_budgets_is_not_taken_for_this_one_and_a_damaged_one_is_named(
+    done, tmp_path
+):
     with pytest.raises(SkillweaveError, match="give another folder with --out"):
         Bench(suite().scaled(2.0), done, seed=0).run("flat")
+    folder = tmp_path / "line" / "right" / "hierarchy"
+    folder.mkdir(parents=True)
+    (folder / "0.json").write_text(json.dumps({"suite": "line"}))
+    with pytest.raises(SkillweaveError, match=r"0\.json is damaged"):
+        Results(tmp_path).all("line")
 
 
 @pytest.mark.slow
@@ -427,14 +434,6 @@ def test_figures_and_the_table_are_made_from_the_files(done, tmp_path):
     text = make_table(suite(), results)
     assert text.count("F1-skill-rewards") == 3  # two tasks, and both together
     assert "tuning" not in text
-
-
-def test_a_damaged_result_is_named(tmp_path, done):
-    folder = tmp_path / "line" / "right" / "hierarchy"
-    folder.mkdir(parents=True)
-    (folder / "0.json").write_text(json.dumps({"suite": "line"}))
-    with pytest.raises(SkillweaveError, match=r"0\.json is damaged"):
-        Results(tmp_path).all("line")
 
 
 def test_a_task_that_is_not_there_is_named_with_those_that_are():
