@@ -805,6 +805,29 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ("DeclarationError", lambda: sw.Lengths(1, 2.5), "Lengths"),
     ("DeclarationError", lambda: sw.Lengths(..., 4), "Lengths"),
     ("DeclarationError", lambda: sw.Lengths(1, ...), "Lengths"),
+    # Networks, and settings of algorithms that do not fit each other
+    ("DeclarationError", lambda: sw.Network(sees=(0,), encoder="cells"), "give sees or encoder"),
+    ("DeclarationError", lambda: sw.algorithms.CNN("plain", (), (), ()), "at least one layer"),
+    ("DeclarationError", lambda: sw.algorithms.CNN(strides=(4, 2)), "have 3, 3 and 2"),
+    (
+        "DeclarationError",
+        lambda: make_algorithm(
+            sw.PPO(network=sw.Network(cnn=sw.algorithms.CNN())),
+            gym.spaces.Box(0, 255, (20, 24, 3), np.uint8),
+            POINT,
+        ),
+        "(3, 20, 24)",
+    ),
+    (
+        "DeclarationError",
+        lambda: make_algorithm(sw.SAC(target_entropy=1.2), POINT, gym.spaces.Discrete(3)),
+        "at most 1.0",
+    ),
+    (
+        "DeclarationError",
+        lambda: make_algorithm(sw.SAC(target_entropy=1.5), POINT, POINT),
+        "SAC.target_entropy is 1.5",
+    ),
     # One argument alone
     (
         "DeclarationError",

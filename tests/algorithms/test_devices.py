@@ -210,15 +210,12 @@ def test_a_device_that_is_not_there_is_told(monkeypatch):
     assert resolve_device("cpu") == torch.device("cpu")
 
 
-def test_a_constant_has_one_copy_on_each_device():
+def test_a_constant_has_one_copy_on_each_device_and_the_cpu_alone_knows_whether_nothing_is_left():
     constant = Constant(torch.tensor([1.0, 2.0]))
     assert constant.on(torch.device("cpu")).tolist() == [1.0, 2.0]
-    copy = constant.on(torch.device("meta"))
+    copy = constant.on(THERE)
     assert copy.device.type == "meta"
-    assert constant.on(torch.device("meta")) is copy
-
-
-def test_whether_nothing_is_left_is_known_on_the_cpu_alone():
+    assert constant.on(THERE) is copy
     nothing = torch.zeros(2, dtype=torch.bool)
     assert all_false(nothing)
     assert not all_false(torch.tensor([False, True]))

@@ -31,6 +31,7 @@ TOGETHER = [
     (TD3, "buffer_size", 31, r"at least 32 \(num_envs \* \(n_step \+ 1\)\)"),
     *((kind, "network", Network(rnn=RNN()), "without rnn: only PPO supports recurrent networks")
       for kind in (DQN, SAC)),
+    (SelfImitationPPO, "network", Network(rnn=RNN()), "without rnn: kept rows have no .* state"),
     *((kind, "critic", Network(rnn=RNN()), "without rnn") for kind in (TD3, PPO)),
     *((kind, "critic", Network(planes="last"), "without planes: Network.planes of network counts "
        "for both") for kind in (SAC, PPO)),

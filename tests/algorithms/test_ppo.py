@@ -229,20 +229,13 @@ def test_observations_are_normalised_by_all_that_were_seen():
 
 
 def test_a_member_that_oversteps_the_kl_stops_and_the_others_go_on():
-    algorithm, state = make(members=2, target_kl=0.01, update_epochs=10)
-    state.learning_rate = torch.tensor([0.05, 1e-5])
-    algorithm.update(state, rollout_of(algorithm, state), rngs(0, 1))
+    algorithm, state = make(members=2, target_kl=1e-4, update_epochs=10)
+    state.learning_rate = torch.tensor([0.01, 1e-7])
+    _, report = algorithm.update(state, rollout_of(algorithm, state), rngs(0, 1))
     assert 0 < state.count[0] < 30
     assert state.count[1] == 30
-
-
-def test_metrics_of_an_update_that_stops_early_are_means_over_the_steps_it_took():
-    algorithm, state = make(target_kl=1e-4, update_epochs=10, learning_rate=1e-2)
-    _, report = algorithm.update(state, rollout_of(algorithm, state), rngs(0))
-    assert 0 < state.count.item() < 30
-    assert report.metrics["entropy"].item() == pytest.approx(
-        np.log(4), rel=0.05
-    )  # still almost uniform
+    # Metrics are means over the steps it took; it is still almost uniform.
+    assert report.metrics["entropy"].tolist() == pytest.approx([np.log(4)] * 2, rel=0.05)
 
 
 @pytest.mark.parametrize("settings", [{}, {"normalize_obs": True}])

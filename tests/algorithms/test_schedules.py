@@ -60,6 +60,9 @@ def test_every_algorithm_follows_it_from_the_start_to_the_end_of_the_budget(kind
             number = kind(learning_rate=1e-3, learning_rate_schedule=schedule)
             assert rate_now(number, rate, 0.25).tolist() == [7.0 * share] * 2
     assert rate_now(SkillCritic(), rate, 0.25).tolist() == [7.0 * 0.75] * 2
+    acts = gym.spaces.Box(-1, 1, (2,)) if kind is TD3 else gym.spaces.Discrete(2)
+    algorithm = make_algorithm(kind(learning_rate=Linear(3e-4, 0)), gym.spaces.Discrete(2), acts)
+    assert algorithm.init([Seeds(0)]).learning_rate.tolist() == pytest.approx([3e-4])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -112,8 +115,11 @@ def test_an_algorithm_of_the_users_own_that_does_not_follow_schedules_refuses_th
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("how", [Linear(2e-3, 5e-4), halving, lambda remaining: 2e-3 * remaining])
-@pytest.mark.parametrize("config", [ON, OFF], ids=["ppo", "dqn"])
+@pytest.mark.parametrize(
+    ("config", "how"),
+    [(ON, Linear(2e-3, 5e-4)), (ON, halving), (OFF, lambda remaining: 2e-3 * remaining)],
+    ids=["ppo, a line", "ppo, a function", "dqn, a function without a name"],
+)
 def test_a_stopped_run_has_the_same_rates_as_one_that_was_not(tmp_path, config, how):
     def declare() -> Hierarchy:
         changed = replace(config, learning_rate=how)
@@ -180,10 +186,3 @@ def test_the_command_line_writes_it_as_a_call():
     assert declared.algorithm.learning_rate == 1e-4
     with pytest.raises(DeclarationError, match=r"selector\.learning_rate=linear"):
         apply_overrides(declared, ["selector.learning_rate=linear(3)"])
-
-
-def test_a_states_rate_is_the_schedules_first_value():
-    algorithm = make_algorithm(
-        PPO(learning_rate=Linear(3e-4, 0)), gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(2)
-    )
-    assert algorithm.init([Seeds(0)]).learning_rate.tolist() == pytest.approx([3e-4])

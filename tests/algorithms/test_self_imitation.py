@@ -12,7 +12,6 @@ from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import SelfImitationPPO
 from skillweave.algorithms.batches import Rollout
 from skillweave.algorithms.registry import make_algorithm
-from skillweave.errors import DeclarationError
 
 SEEN, THREE = Box(-1.0, 1.0, (2,), np.float32), Discrete(3)
 CONFIG = SelfImitationPPO(
@@ -62,13 +61,19 @@ def test_rows_are_kept_whose_return_exceeds_the_value():
     assert state.kept_action[0, :2].tolist() == [1, 1]
 
 
-def test_only_trajectories_that_terminated_count():
+def test_only_trajectories_that_terminated_count_and_no_rows_of_others_and_of_reflexes():
     algorithm, state = make()
     # The first column ends after two rows, and begins anew; the other is cut after one.
     rows = rollout([[0.0, 1.0, 7.0, 7.0], [8.0, 9.0, 9.0, 9.0]], ends=[(1, 0)])
     rows.last[0, 0, 1] = True
     algorithm.keep(state, rows)
     assert kept_returns(state) == [0.5, 1.0]
+    algorithm, state = make()
+    ends = [(0, 0), (1, 0), (2, 0)]
+    valid = torch.tensor([True, True, False]).view(1, 3, 1)
+    reflex = torch.tensor([True, False, False]).view(1, 3, 1)
+    algorithm.keep(state, rollout([[1.0, 2.0, 3.0]], ends=ends, valid=valid, overridden=reflex))
+    assert kept_returns(state) == [2.0]
 
 
 def test_the_latest_rows_are_kept_and_the_oldest_go_first():
@@ -78,15 +83,6 @@ def test_the_latest_rows_are_kept_and_the_oldest_go_first():
     torch.testing.assert_close(state.kept_return[0], torch.tensor([3.0, 3.1, 2.0]))
     algorithm.keep(state, rollout([[0.0, 0.0]], ends=[(1, 0)]))  # nothing good came: nothing goes
     torch.testing.assert_close(state.kept_return[0], torch.tensor([3.0, 3.1, 2.0]))
-
-
-def test_rows_of_others_and_of_reflexes_are_not_kept():
-    algorithm, state = make()
-    ends = [(0, 0), (1, 0), (2, 0)]
-    valid = torch.tensor([True, True, False]).view(1, 3, 1)
-    reflex = torch.tensor([True, False, False]).view(1, 3, 1)
-    algorithm.keep(state, rollout([[1.0, 2.0, 3.0]], ends=ends, valid=valid, overridden=reflex))
-    assert kept_returns(state) == [2.0]
 
 
 def test_the_loss_is_that_of_the_paper_written_plainly():
@@ -170,10 +166,3 @@ def test_a_few_rows_are_not_learnt_by_heart(batch, most, steps):
     algorithm.keep(state, rollout([[0.0, 0.0, 0.0, 3.0]], ends=[(3, 0)]))
     algorithm.imitate(state, state.learning_rate, rngs())
     assert state.count.tolist() == [steps]
-
-
-def test_memory_is_refused():
-    from skillweave.algorithms import RNN
-
-    with pytest.raises(DeclarationError, match=r"SelfImitationPPO\.network .* without rnn"):
-        SelfImitationPPO(network=Network(rnn=RNN("gru", 4)))

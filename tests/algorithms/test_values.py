@@ -47,19 +47,15 @@ def assert_worth(algorithm, state, mask, expected: list[torch.Tensor]):
     torch.testing.assert_close(found, torch.stack(expected), rtol=1e-4, atol=1e-5)
 
 
-def test_ppos_is_its_critics_in_units_of_reward():
+def test_ppos_is_its_critics_in_units_of_reward_with_a_memory_at_the_start_of_an_episode():
     algorithm, state = made(PPO(**LINE), Discrete(A))
     views = algorithm.layout.views(state.params)
     raw = [line(views, "critic", m, X[m])[:, 0] for m in range(P)]
     assert_worth(algorithm, state, None, [2.0 * raw[0] + 3.0, 3.0 * raw[1] - 1.0])
-
-
-def test_ppos_with_a_memory_is_that_at_the_start_of_an_episode():
     network = Network((), rnn=RNN("gru", 4))
     algorithm, state = made(PPO(network=network, normalize_obs=False), Discrete(A))
-    memory = torch.zeros(P, B, 4)
     views = algorithm.layout.views(state.params)
-    raw = algorithm.critic_net.step(views, {"vector": X}, memory)[0][..., 0]
+    raw = algorithm.critic_net.step(views, {"vector": X}, torch.zeros(P, B, 4))[0][..., 0]
     assert_worth(algorithm, state, None, [2.0 * raw[0] + 3.0, 3.0 * raw[1] - 1.0])
 
 

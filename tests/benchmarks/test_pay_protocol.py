@@ -11,10 +11,10 @@ from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from declaring import plainly
+from line_world import TINY, Line
 
 from benchmarks.pay import __main__ as command, agents
 from benchmarks.pay.agents import CHAINS, FLAT, HIERARCHY, SHAPED, TUNED, TUNING_SEED, Bench
@@ -30,35 +30,9 @@ from benchmarks.pay.results import (
     read,
 )
 from benchmarks.pay.suite import Seldom, Shaped, Suite, Task
-from skillweave import PPO, EnvSpec, Hierarchy, Network, Run, Skill, SkillweaveError, Step
+from skillweave import EnvSpec, Hierarchy, Run, Skill, SkillweaveError, Step
 from skillweave.hierarchy import select_best
 from skillweave.types import Evaluation
-
-TINY = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
-
-
-class Line(gym.Env):
-    """Places −3 to 3; the end of one side pays 1."""
-
-    observation_space = gym.spaces.Box(-3.0, 3.0, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def __init__(self, goal=3):
-        self.goal = goal
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.place, self.steps = 0, 0
-        return self._obs(), {}
-
-    def step(self, action):
-        self.steps += 1
-        self.place = int(np.clip(self.place + 2 * action - 1, -3, 3))
-        there = self.place == self.goal
-        return self._obs(), float(there), there, self.steps == 12 and not there, {}
-
-    def _obs(self):
-        return np.array([self.place], np.float32)
 
 
 class Right(Skill):
@@ -118,8 +92,7 @@ def done(tmp_path_factory):
     return results
 
 
-@pytest.mark.slow
-def test_every_agent_has_a_result_on_every_task(done):
+def test_every_agent_has_a_result_on_every_task_and_its_steps_are_counted(done):
     found = [r for r in done.all("line") if r.seed == 0]
     by_agent = Counter(r.agent for r in found)
     assert set(by_agent.values()) == {2}
@@ -131,6 +104,15 @@ def test_every_agent_has_a_result_on_every_task(done):
         "long-calls",
     }
     assert all(len(r.scores) == 4 and np.mean(r.scores) == r.score for r in found)
+    for r in done.all("line"):
+        rollout = TINY.num_envs * TINY.n_steps
+        assert r.budget <= r.steps < r.budget + 3 * rollout + 1
+    of = {(r.agent, r.task): r.score for r in found}
+    for task in ("right", "left"):  # the best skill goes to the side that pays
+        assert of["F4-best-skill", task] >= of["always-right", task]
+    found = reported(done.all("line"), [0])
+    own = [r for r in found if (r.task, r.agent) != ("right", TUNED)]  # of F3 the first is F0's
+    assert hours(found) == pytest.approx(sum(r.seconds for r in own) / 3600.0)
 
 
 def test_budgets_are_equal_or_in_favour_of_the_flat_agents():
@@ -161,21 +143,6 @@ def test_f1_and_f2_learn_the_first_task_and_those_that_are_named(tmp_path, chain
     assert {r.task for r in results.all("line")} == {"right", "left"}
 
 
-@pytest.mark.slow
-def test_steps_are_counted_as_they_were_made(done):
-    for r in done.all("line"):
-        rollout = TINY.num_envs * TINY.n_steps
-        assert r.budget <= r.steps < r.budget + 3 * rollout + 1
-
-
-@pytest.mark.slow
-def test_the_best_single_skill_goes_to_the_side_that_pays(done):
-    found = {r.task: r for r in done.all("line") if r.agent == "always-right"}
-    best = {r.task: r for r in done.all("line") if r.agent == "F4-best-skill"}
-    assert best["right"].score >= found["right"].score
-    assert best["left"].score >= found["left"].score
-
-
 def test_what_is_there_is_not_run_again(done, monkeypatch):
     before = {r.task + r.agent: r for r in done.all("line")}
 
@@ -189,9 +156,16 @@ def test_what_is_there_is_not_run_again(done, monkeypatch):
     assert {r.task + r.agent: r for r in done.all("line")} == before
 
 
-def test_a_result_of_other_budgets_is_not_taken_for_this_one(done):
+def test_a_result_of_other_budgets_is_not_taken_for_this_one_and_a_damaged_one_is_named(
+    done, tmp_path
+):
     with pytest.raises(SkillweaveError, match="give another folder with --out"):
         Bench(suite().scaled(2.0), done, seed=0).run("flat")
+    folder = tmp_path / "line" / "right" / "hierarchy"
+    folder.mkdir(parents=True)
+    (folder / "0.json").write_text(json.dumps({"suite": "line"}))
+    with pytest.raises(SkillweaveError, match=r"0\.json is damaged"):
+        Results(tmp_path).all("line")
 
 
 @pytest.mark.slow
@@ -222,28 +196,21 @@ def test_the_checksum_of_code_is_of_every_file_and_its_place(tmp_path):
     assert len({first, second, checksum(tmp_path)}) == 3
 
 
-def test_what_is_built_on_skills_of_other_code_is_of_other_code(done, tmp_path):
+def test_what_is_built_on_other_code_is_of_other_code(done, tmp_path):
     shutil.copytree(done.folder, tmp_path / "pay")
     results = Results(tmp_path / "pay")
     source, last = (results.file("line", task, HIERARCHY, 0) for task in ("right", "left"))
-    results.save(replace(read(source), code="1f"))
+    told = json.loads(last.read_text())
+    results.save(replace(read(source), code="1f"))  # its skills
     last.unlink()
     Bench(suite(), results, seed=0).run("hierarchy", ["left"])
     assert read(last).code == ""
-
-
-def test_a_training_that_other_code_began_is_of_other_code(tmp_path):
     run = Results(tmp_path).run_path("line", "left", HIERARCHY, 0)
     Results(tmp_path).begin(run)
     assert Results(tmp_path).begun_by(run) == CODE
     run.mkdir()
     Results(tmp_path).begin(run)  # it goes on, and nobody noted who began it
     assert Results(tmp_path).begun_by(run) == ""
-
-
-def test_a_result_that_does_not_say_its_code_is_of_other_code(done, tmp_path):
-    found = done.file("line", "left", HIERARCHY, 0)
-    told = json.loads(found.read_text())
     del told["code"]
     (tmp_path / "0.json").write_text(json.dumps(told))
     assert "1 of these 1 results" in of_other_code([read(tmp_path / "0.json")])
@@ -372,6 +339,9 @@ def test_curves_are_of_the_tasks_own_reward_whatever_is_learnt(done):
         assert len(r.curve) > 1
         assert steps == sorted(steps)
         assert all(0.0 <= score <= 1.0 for _, score in r.curve)  # F1's own reward goes beyond
+    path = done.run_path("line", "right", HIERARCHY, 0)
+    curve = curve_of(path, 1.0, ("selector",))
+    assert curve[0][0] > 2 * 128  # skills came first
 
 
 def test_rewards_of_skills_are_added_by_weight():
@@ -452,12 +422,6 @@ def test_f3_follows_the_hierarchy_from_task_to_task(tmp_path):
     assert bench._path(after[1], TUNED).exists()
 
 
-def test_the_hours_of_results_count_f3_on_the_first_task_once(done):
-    found = reported(done.all("line"), [0])
-    own = [r for r in found if (r.task, r.agent) != ("right", TUNED)]
-    assert hours(found) == pytest.approx(sum(r.seconds for r in own) / 3600.0)
-
-
 @pytest.mark.slow
 def test_figures_and_the_table_are_made_from_the_files(done, tmp_path):
     pytest.importorskip("matplotlib")
@@ -472,14 +436,6 @@ def test_figures_and_the_table_are_made_from_the_files(done, tmp_path):
     assert "tuning" not in text
 
 
-def test_a_damaged_result_is_named(tmp_path, done):
-    folder = tmp_path / "line" / "right" / "hierarchy"
-    folder.mkdir(parents=True)
-    (folder / "0.json").write_text(json.dumps({"suite": "line"}))
-    with pytest.raises(SkillweaveError, match=r"0\.json is damaged"):
-        Results(tmp_path).all("line")
-
-
 def test_a_task_that_is_not_there_is_named_with_those_that_are():
     with pytest.raises(SkillweaveError, match="no suite 'shuttl'; there are: shuttle"):
         command.chosen(["shuttl"])
@@ -487,12 +443,6 @@ def test_a_task_that_is_not_there_is_named_with_those_that_are():
         command.chosen(["shuttle/x"])
     assert command.chosen(["shuttle/shuttle-4"]) == {"shuttle": ["shuttle-4"]}
     assert set(command.chosen([])) == set(command.SUITES)
-
-
-def test_curves_count_the_steps_of_earlier_stages(done):
-    path = done.run_path("line", "right", HIERARCHY, 0)
-    curve = curve_of(path, 1.0, ("selector",))
-    assert curve[0][0] > 2 * 128  # skills came first
 
 
 @pytest.mark.slow

@@ -15,29 +15,20 @@ def test_the_mean_is_that_of_the_middle_half_of_all_tasks_and_seeds():
     assert mean_of_all([[0, 7000, 2, 5], [4, 3, 6, 1]]) == pytest.approx(3.5)
 
 
-def test_scores_that_are_all_the_same_leave_no_doubt():
+def test_intervals_by_hand():
     assert interval([[3.0] * 5]) == (3.0, 3.0)
-
-
-def test_seeds_are_drawn_within_their_task():
-    # Half of every sample is 0 and half is 1, whatever is drawn: were they drawn from all, the
-    # interval would be wide.
+    # Seeds are drawn within their task. Half of every sample is 0 and half is 1, whatever is
+    # drawn: were they drawn from all, the interval would be wide.
     assert interval([[0.0] * 5, [1.0] * 5]) == (0.5, 0.5)
     low, high = interval([[0.0] * 5 + [1.0] * 5])
     assert low < 0.2
     assert high > 0.8
-
-
-def test_the_interval_of_two_seeds_is_that_of_their_four_samples():
     # Samples of (0, 4): both 0, one each (2, twice as often), both 4. The quartiles of these
     # 1 : 2 : 1 are between 0 and 2, and between 2 and 4; 90 % of the samples reach the ends.
     assert interval([[0.0, 4.0]], level=0.9) == (0.0, 4.0)
     assert interval([[0.0, 4.0]], level=0.4) == (2.0, 2.0)
-
-
-def test_an_interval_does_not_depend_on_when_it_is_asked():
     scores = [list(np.random.default_rng(0).normal(size=5))]
-    assert interval(scores) == interval(scores)
+    assert interval(scores) == interval(scores)  # whenever it is asked
 
 
 def test_the_first_score_at_the_bar_counts():

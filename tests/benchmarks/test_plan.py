@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from line_world import TINY, Line
 from planning.logs import log_of
 
 from benchmarks.pay.results import Result
@@ -12,30 +12,10 @@ from benchmarks.plan import __main__ as command
 from benchmarks.plan.cells import BY_HAND, PLANNER, SELECTOR, Cells
 from benchmarks.plan.chains import InOrder, did_all
 from benchmarks.plan.families import FAMILIES, Family, NewTask, in_box, share_done
-from skillweave import PPO, Apart, EnvSpec, Hierarchy, Network, Skill, SkillweaveError
+from skillweave import Apart, EnvSpec, Hierarchy, Skill, SkillweaveError
 from skillweave.planning import Mission
 
-TINY = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
-
-
-class Line(gym.Env):
-    """Places −3 to 3; pays 1 at the left end, once the right end was seen."""
-
-    observation_space = gym.spaces.Box(-3.0, 3.0, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.place, self.seen, self.steps = 0, False, 0
-        return np.array([0], np.float32), {}
-
-    def step(self, action):
-        self.steps += 1
-        self.place = int(np.clip(self.place + 2 * action - 1, -3, 3))
-        self.seen |= self.place == 3
-        done = self.seen and self.place == -3
-        obs = np.array([self.place], np.float32)
-        return obs, float(done), done, self.steps == 20 and not done, {}
+LINE = EnvSpec(Line, {"goal": -3, "first": 3, "length": 20})
 
 
 class Right(Skill):
@@ -76,13 +56,13 @@ def nowhere(obs):
 
 def declare(**how):
     settings = {"algorithm": TINY, "selector": TINY, "call_steps": None, "learn": "apart"} | how
-    return Hierarchy(EnvSpec(Line), [Right(), Left()], **settings)
+    return Hierarchy(LINE, [Right(), Left()], **settings)
 
 
 def family(event=left):
     return Family(
         name="line",
-        tasks=[NewTask("there-and-back", EnvSpec(Line), Mission(right, event), 400, "line")],
+        tasks=[NewTask("there-and-back", LINE, Mission(right, event), 400, "line")],
         source=lambda: declare(selector=lambda obs: ["right"] * len(obs)),
         over=lambda task, skills, **how: declare(**how),
         planner={"gamma": 0.9},
@@ -127,7 +107,7 @@ def test_the_table_has_a_line_for_each_agent_and_one_for_all_tasks():
     def result(task, agent, seed, score):
         return Result("line", task, agent, seed, score, 400, 400, 1.0)
 
-    tasks = [NewTask(name, EnvSpec(Line), None, 400, "line") for name in ("a", "b")]
+    tasks = [NewTask(name, LINE, None, 400, "line") for name in ("a", "b")]
     results = [result("a", f"planner-{log}", 0, score) for log, score in ((1, 1.0), (2, 0.9))]
     results += [result("b", "planner-1", 1, 0.2), result("b", "selector", 1, 0.5)]
     lines = command.make_table(family(), tasks, results).splitlines()[2:]

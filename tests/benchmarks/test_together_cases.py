@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import hierarchy
 from benchmarks.chains import TASKS, Task
 from benchmarks.pay.flat import Flat
 from benchmarks.together import CASES, check_case, one, without_selector
@@ -79,11 +78,8 @@ def test_a_case_changes_what_it_names_and_nothing_else(case, tasks, usual, chang
 def test_a_case_that_says_nothing_on_a_task_is_refused(task, case, says):
     with pytest.raises(SkillweaveError, match=says):
         check_case(case, task)
-
-
-@pytest.mark.parametrize("case", ["together", "limit ends", "then, no anchor", "flat", "bonus"])
-def test_a_case_that_says_something_is_not(case):
-    check_case(case, "bridge")
+    for other in ("together", "limit ends", "then, no anchor", "flat", "bonus"):
+        check_case(other, "bridge")
 
 
 def test_a_skills_value_ends_at_the_limit_of_its_calls():
@@ -118,14 +114,6 @@ def test_the_lander_is_what_the_measured_table_says():
     assert manifest(same, seed=0, flat=False) == manifest(found, seed=0, flat=False)
     then = CASES["then"](TASKS["lander"], steps)
     assert then.selector == found.selector, "budgets alone differ"
-
-
-def test_other_recipes_have_no_settings_to_learn_apart(monkeypatch, capsys):
-    asked = ["hierarchy", "--apart", "--recipe", "shuttle"]
-    monkeypatch.setattr("sys.argv", asked)
-    with pytest.raises(SystemExit):
-        hierarchy.main()
-    assert "those of the recipe lunar-lander" in capsys.readouterr().err
 
 
 def test_who_learns_is_the_same_but_for_what_a_case_names():
@@ -237,12 +225,6 @@ def test_skills_are_scored_without_their_selector(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_hierarchys_skills_are_scored_when_asked():
-    found = one("together", "bridge", 4_000, "auto", f4=True, seed=0)
-    assert list(found["f4"]) == ["at random", "get_axe", "chop", "build", "cross"]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("task", ["bridge", "lander"])
 def test_skills_alone_are_scored_as_the_run_plays_them(task, monkeypatch):
     asked = []
@@ -258,3 +240,4 @@ def test_skills_alone_are_scored_as_the_run_plays_them(task, monkeypatch):
     assert found["kept"]["kept"] != "skills_sample", "else the two say the same"
     skills = CASES["together"](TASKS[task], 4_000).skills
     assert asked[1:] == [*((greedy, s.name) for s in skills), (None, None)]
+    assert list(found["f4"]) == ["at random", *(s.name for s in skills)]

@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from small_runs import SMALL
 
 from skillweave import DQN, Agent, SkillweaveError
 from skillweave.buffers import ram
-from tests.small_runs import SMALL
 
 GB = 2**30
 
@@ -40,28 +40,29 @@ def under(folder: str, files: dict[str, str]) -> dict[str, str]:
     return {f"{folder}/{name}": text for name, text in files.items()}
 
 
-def test_a_machine_without_groups(system):
-    assert ram.free_memory() == 64 * GB
+ROOT = {"proc/self/cgroup": "0::/\n"}
+NESTED = {
+    "proc/self/cgroup": "0::/slurm/job_1/step_0\n",
+    **under("cgroup/slurm", group(str(9 * GB), GB)),
+    **under("cgroup/slurm/job_1", group(str(5 * GB), GB)),
+    **under("cgroup/slurm/job_1/step_0", group("max", GB)),
+}
+SYSTEMS = {
+    "no groups": ({}, 64 * GB),
+    "a container's group is the root": (
+        ROOT | under("cgroup", group(str(4 * GB), 3 * GB, files=GB)),
+        2 * GB,
+    ),
+    "the tightest group on the way": (NESTED, 4 * GB),
+    "a group over its limit": (ROOT | under("cgroup", group(str(GB), 2 * GB)), 0),
+}
 
 
-def test_a_container_sees_its_group_as_the_root(system):
-    system({"proc/self/cgroup": "0::/\n"})
-    system(under("cgroup", group(str(4 * GB), 3 * GB, files=GB)))
-    assert ram.free_memory() == 2 * GB
-
-
-def test_the_tightest_group_on_the_way_counts(system):
-    system({"proc/self/cgroup": "0::/slurm/job_1/step_0\n"})
-    system(under("cgroup/slurm", group(str(9 * GB), GB)))
-    system(under("cgroup/slurm/job_1", group(str(5 * GB), GB)))
-    system(under("cgroup/slurm/job_1/step_0", group("max", GB)))
-    assert ram.free_memory() == 4 * GB
-
-
-def test_a_group_that_is_over_its_limit_has_nothing(system):
-    system({"proc/self/cgroup": "0::/\n"})
-    system(under("cgroup", group(str(GB), 2 * GB)))
-    assert ram.free_memory() == 0
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_what_groups_leave_is_free(system, name):
+    files, free = SYSTEMS[name]
+    system(files)
+    assert ram.free_memory() == free
 
 
 def test_the_first_version_of_groups_under_the_name_outside_of_the_container(system):
@@ -79,7 +80,7 @@ def test_the_first_version_of_groups_under_the_name_outside_of_the_container(sys
 
 
 def test_a_replay_buffer_that_a_container_cannot_hold_is_refused(system, tmp_path):
-    system({"proc/self/cgroup": "0::/\n"})
+    system(ROOT)
     system(under("cgroup", group(str(2**20), 2**19)))
     dqn = DQN(num_envs=2, buffer_size=100_000, batch_size=8, learning_starts=20, network=SMALL)
     with pytest.raises(SkillweaveError, match="GiB are free: lower buffer_size"):

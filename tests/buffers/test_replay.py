@@ -91,11 +91,8 @@ def test_n_steps_stop_at_ends_cuts_and_the_newest_step():
         assert found[0] == (2, 0.25 * factor, successor)
         assert found[1] == (2, 0.5 * factor, successor)
         assert found[2] == (8, 0.25, 4)
-
-
-def test_calls_discount_by_their_length():
-    store = line([1, 2, 4], steps=[1, 3, 2], n_step=2)
-    assert by_time(store) == {0: (2, 1 / 16, 2), 1: (2.5, 1 / 32, 3), 2: (4, 0.25, 3)}
+    calls = line([1, 2, 4], steps=[1, 3, 2], n_step=2)  # discounted by their length
+    assert by_time(calls) == {0: (2, 1 / 16, 2), 1: (2.5, 1 / 32, 3), 2: (4, 0.25, 3)}
 
 
 @pytest.mark.parametrize("at_once", [1, 2, 10])
@@ -107,20 +104,13 @@ def test_overwritten_steps_are_gone_and_an_end_takes_the_room_of_a_step(at_once)
     assert by_time(store) == {6: (6, 0.5, 7), 7: (7, 0.5, 7.5), 8: (8, 0.5, 9)}
 
 
-def test_cutting_an_empty_or_a_cut_store_does_nothing():
+def test_what_adds_nothing_changes_nothing():
     store = make(10)
     store.cut(np.arange(1))
     assert len(store) == 0
     store = line([1, 2], ".c")
     before = store.state()
-    store.cut(np.arange(1))
-    after = store.state()
-    assert all(torch.equal(after[name], before[name]) for name in before)
-
-
-def test_an_experience_of_nobody_changes_nothing():
-    store = line([1, 2, 4])
-    before = store.state()
+    store.cut(np.arange(1))  # again
     nobody = World(store, 1, np.random.default_rng(0), filled=0.0)
     store.add(nobody.collect(3))
     store.add(nobody.collect(0))
@@ -464,26 +454,34 @@ def test_frequencies_and_weights_of_priorities():
     assert weight == pytest.approx({0: 1, 1: 2**-0.5, 2: 5**-0.5})
 
 
-def test_new_transitions_have_the_highest_priority_so_far():
+def with_a_new_one() -> ReplayStore:
     store = line([0, 0], capacity=4, prioritized=True, alpha=1.0)
     store.update_priorities(np.array([[0, 1]]), torch.tensor([[3.0, 1.0]]))
     store.update_priorities(np.array([[0]]), torch.tensor([[2.0]]))
     store.add(rows_of(np.full((1, 2), 2.0), np.zeros(1), np.zeros((1, 2))))
-    frequency, _ = places(store)
-    assert frequency == pytest.approx({0: 2 / 6, 1: 1 / 6, 2: 3 / 6}, abs=1e-3)
+    return store
 
 
-def test_priorities_of_overwritten_transitions_are_skipped():
+def overwritten() -> ReplayStore:
     store = line(range(9), capacity=4, prioritized=True, alpha=1.0)
     store.update_priorities(np.arange(9)[None], torch.tensor([[9.0] * 5 + [1, 2, 3, 4]]))
-    frequency, _ = places(store)
-    assert frequency == pytest.approx({5: 0.1, 6: 0.2, 7: 0.3, 8: 0.4}, abs=1e-3)
+    return store
 
 
-def test_boundaries_have_no_priority():
-    store = line(range(9), ".l.t.l", capacity=6, prioritized=True, alpha=1.0)
-    frequency, _ = places(store)
-    assert frequency == pytest.approx(dict.fromkeys([4, 5, 6, 7, 8], 1 / 5), abs=1e-3)
+def with_ends() -> ReplayStore:
+    return line(range(9), ".l.t.l", capacity=6, prioritized=True, alpha=1.0)
+
+
+@pytest.mark.parametrize(
+    ("store", "expected"),
+    [
+        (with_a_new_one, {0: 2 / 6, 1: 1 / 6, 2: 3 / 6}),  # as likely as the likeliest so far
+        (overwritten, {5: 0.1, 6: 0.2, 7: 0.3, 8: 0.4}),
+        (with_ends, dict.fromkeys([4, 5, 6, 7, 8], 1 / 5)),
+    ],
+)
+def test_priorities_are_of_what_is_there(store, expected):
+    assert places(store())[0] == pytest.approx(expected, abs=1e-3)
 
 
 def test_members_that_share_transitions_have_priorities_of_their_own():

@@ -70,28 +70,6 @@ def test_columns_are_member_after_member():
     assert all(x[p].is_contiguous() for x in rows for p in range(P))
 
 
-def test_each_members_discount_is_its_gamma_to_the_calls_length():
-    r = rollout(experience(2, steps=np.array([[1], [3]])))
-    torch.testing.assert_close(
-        r.discount, torch.tensor([[[0.9, 0.9], [0.729, 0.729]], [[0.5, 0.5], [0.125, 0.125]]])
-    )
-
-
-def test_a_termination_has_discount_zero_and_a_truncation_has_not_and_both_are_last():
-    r = rollout(experience(terminated=[(0, 0)], truncated=[(1, 3)]))
-    assert r.discount[0, :, 0].tolist() == pytest.approx([0.0, 0.9, 0.9])
-    assert r.discount[1, :, 1].tolist() == pytest.approx([0.5] * 3)
-    assert r.last[0, :, 0].tolist() == [True, False, True]
-    assert r.last[1, :, 1].tolist() == [False, True, True]
-
-
-def test_the_end_of_the_rollout_cuts_every_trajectory_but_keeps_its_discount():
-    r = rollout(experience())
-    assert r.last[:, -1].all()
-    assert not r.last[:, :-1].any()
-    assert (r.discount > 0).all()
-
-
 def test_masks_travel_with_their_observations():
     e = experience()
     e = e.replace(mask=np.random.default_rng(0).random((T, P * B, A)) < 0.5)

@@ -43,13 +43,6 @@ def test_a_tiny_demo_trains_scores_films_and_says_what_came_out(
     assert all((out / run / "run.json").exists() for run in ("lunar-lander", "mission"))
 
 
-def test_it_does_not_write_into_a_folder_that_exists(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["demo", "--out", str(tmp_path)]) == 1
-    assert f"{tmp_path} exists already: choose another folder" in capsys.readouterr().err
-
-
 def test_the_recorded_flat_agents_have_all_steps_of_the_hierarchies() -> None:
     recorded: dict[str, dict[str, Any]] = json.loads(FLAT_RESULTS.read_text())
     skills_and_selector = missions.declare().total_steps

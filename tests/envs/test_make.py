@@ -87,16 +87,6 @@ class Unseen(gym.Env):
         pass
 
 
-def test_a_registered_environment_need_not_know_how_it_is_rendered():
-    gym.register("Unseen-v0", Unseen)
-    try:
-        assert isinstance(EnvSpec("Unseen-v0").make().unwrapped, Unseen)
-        with pytest.raises(EnvError, match=r"Unseen-v0.*render_mode"):
-            EnvSpec("Unseen-v0").make("rgb_array")
-    finally:
-        del gym.registry["Unseen-v0"]
-
-
 class Shown(Unseen):
     """Opens a window unless it is told not to."""
 
@@ -104,15 +94,23 @@ class Shown(Unseen):
         self.mode = render_mode
 
 
-def test_training_opens_no_window_whatever_an_environment_does_by_itself():
+def test_a_registered_environment_need_not_know_how_it_is_rendered_and_opens_no_window(
+    monkeypatch,
+):
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    gym.register("Unseen-v0", Unseen)
     gym.register("Shown-v0", Shown)
-    try:
-        assert EnvSpec("Shown-v0").make().unwrapped.mode is None
-    finally:
-        del gym.registry["Shown-v0"]
+    assert isinstance(EnvSpec("Unseen-v0").make().unwrapped, Unseen)
+    with pytest.raises(EnvError, match=r"Unseen-v0.*render_mode"):
+        EnvSpec("Unseen-v0").make("rgb_array")
+    assert EnvSpec("Shown-v0").make().unwrapped.mode is None
 
 
-def test_a_function_that_makes_environments_gets_kwargs():
+class Bare(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+
+def test_a_function_that_makes_environments_gets_kwargs_and_a_class_must_take_how_to_draw():
     def short(render_mode=None, longest=500):
         return gym.make("CartPole-v1", render_mode=render_mode, max_episode_steps=longest)
 
@@ -124,11 +122,5 @@ def test_a_function_that_makes_environments_gets_kwargs():
         EnvSpec(short, kwargs={"longer": 7}).make()
     with pytest.raises(EnvError, match=r"short could not be made: TypeError.*'longer'"):
         EnvSpec(short, kwargs={"longer": 7}).make(render_mode="rgb_array")
-
-
-def test_a_class_that_takes_nothing_is_told_that_films_need_render_mode():
-    class Bare(gym.Env):
-        observation_space = action_space = gym.spaces.Discrete(2)
-
     with pytest.raises(EnvError, match=r"Bare cannot be rendered: .* must take render_mode"):
         EnvSpec(Bare).make(render_mode="rgb_array")

@@ -288,11 +288,11 @@ def test_others_are_not_blamed(env):
 def test_a_training_says_it_once(env, workers, tmp_path, capsys):
     small = sw.PPO(num_envs=4, n_steps=128, batch_size=64, update_epochs=1)
     spec = sw.EnvSpec(env, workers=workers)
-    sw.train_agent(spec, small, 1_024, tmp_path / "run", seed=0)
+    sw.train_agent(spec, small, 512, tmp_path / "run", seed=0)
     said = capsys.readouterr().err
     assert (said.count(SHARED), said.count(KEPT)) == ((1, 0) if env is Global else (0, 1))
     sw.train_agent(
-        sw.EnvSpec(env, workers=workers, check_seed=False), small, 1_024, tmp_path / "quiet"
+        sw.EnvSpec(env, workers=workers, check_seed=False), small, 512, tmp_path / "quiet"
     )
     said = capsys.readouterr().err
     assert SHARED not in said

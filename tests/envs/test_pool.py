@@ -115,14 +115,6 @@ def test_where_a_pool_cannot_be_made_the_environment_itself_is_stepped():
         make_engine(sw.EnvSpec(OneClock, pool=missing, engine="envpool"), 2)
 
 
-def test_a_pool_of_another_environment_is_told():
-    class Wide(Clock):
-        observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
-
-    with pytest.raises(EnvError, match=r"OneClock: its pool's observation_space is Box.*3"):
-        make_engine(sw.EnvSpec(OneClock, pool=Wide), 2)
-
-
 def test_what_envpool_shows_may_be_changed():
     pytest.importorskip("envpool")
 
@@ -220,6 +212,10 @@ def test_one_environment_of_a_pool_is_one_of_gymnasium():
     assert terminated
     assert env.reset()[0]["root"] == 5  # the same pool goes on
     assert one_of(later)().render() is None
+    starts = {int(one_of(later)().reset()[0]["root"]) for _ in range(8)}
+    assert len(starts) > 1  # without a seed it starts anywhere
+    assert sw.EnvSpec(one_of(later), pool=later).name == "later"
+    assert sw.EnvSpec(one_of(Clock), pool=Clock).name == "Clock"
     clock = one_of(Clock)("rgb_array")
     with pytest.raises(gym.error.ResetNeeded):
         clock.step(1)
@@ -228,18 +224,16 @@ def test_one_environment_of_a_pool_is_one_of_gymnasium():
         clock.render()
 
 
-def test_one_environment_of_a_pool_has_the_pools_name_and_starts_anywhere_without_a_seed():
-    assert sw.EnvSpec(one_of(later), pool=later).name == "later"
-    assert sw.EnvSpec(one_of(Clock), pool=Clock).name == "Clock"
-    starts = {int(one_of(later)().reset()[0]["root"]) for _ in range(8)}
-    assert len(starts) > 1
+def test_a_pool_of_another_environment_is_told():
+    class Wide(Clock):
+        observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
 
-
-def test_a_pool_with_other_parts_is_told():
     def other(num_envs, threads, seed):
         space = gym.spaces.Dict(time=gym.spaces.Box(0, 1000, (2,)), root=gym.spaces.Discrete(1000))
         return PoolWrapper(Parts(num_envs, threads, seed), space)
 
+    with pytest.raises(EnvError, match=r"OneClock: its pool's observation_space is Box.*3"):
+        make_engine(sw.EnvSpec(OneClock, pool=Wide), 2)
     with pytest.raises(EnvError, match=r"later: its pool's observation_space is Dict"):
         make_engine(sw.EnvSpec(one_of(later), pool=other), 2)
 

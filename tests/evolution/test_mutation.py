@@ -180,11 +180,6 @@ def test_random_settings_cover_their_ranges_and_fit_together():
             Evolution(),
             r"stage x: Mutations\.architecture is 0.2, but network has layer_norm",
         ),
-        (
-            DQN(),
-            Evolution(mutations=Mutations(ranges={"clip_coef": Range(0.1, 0.3)})),
-            "stage x: .*DQN has no setting 'clip_coef'",
-        ),
     ],
 )
 def test_mutations_that_an_agent_does_not_have_are_refused(config, evolution, said):

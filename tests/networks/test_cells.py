@@ -21,21 +21,6 @@ from skillweave.spaces import obs_codec
 GRID = gym.spaces.Box(0, 255, (3, 3, 2), np.uint8)
 
 
-def test_features_are_those_of_a_dense_layer_on_one_hot_cells():
-    encoder, members, batch = CellsEncoder(obs_codec(GRID)), 2, 5
-    rng = torch.Generator().manual_seed(0)
-    views = {
-        name: torch.randn(members, *shape, generator=rng) for name, shape in encoder.shapes.items()
-    }
-    image = torch.randint(0, 20, (members, batch, 2, 3, 3), generator=rng).to(torch.uint8)
-    found = encoder(views, {"image.0": image})
-    kinds = image.flatten(2).long().clamp(max=CELL_KINDS - 1)  # 16 and more are one kind
-    one_hot = torch.nn.functional.one_hot(kinds, CELL_KINDS).flatten(2).float()
-    want = torch.relu(one_hot @ views["0.weight"] + views["0.bias"])
-    assert found.shape == (members, batch, CELL_FEATURES) == (members, batch, encoder.size)
-    torch.testing.assert_close(found, want, rtol=1e-4, atol=1e-4)
-
-
 HIGHEST = np.array([[[1, 4]], [[0, 9]], [[2, 99]]])  # more than 15 count as 15
 """Of each value of three cells, in one column."""
 
@@ -109,7 +94,7 @@ def test_kinds_are_the_same_in_other_types_of_numbers(dtype):
 @pytest.mark.parametrize("at_once", [1, ONE_HOT_AT_ONCE])
 @pytest.mark.parametrize("members", [1, 2])
 @pytest.mark.parametrize("batch", [1, 3, 4, 5, 13])
-def test_gradients_are_those_of_a_dense_layer_on_one_hot_cells(
+def test_features_and_gradients_are_those_of_a_dense_layer_on_one_hot_cells(
     batch, members, at_once, monkeypatch
 ):
     # In parts of four rows, or in one.
@@ -127,14 +112,14 @@ def test_gradients_are_those_of_a_dense_layer_on_one_hot_cells(
     }
     dense = []
     for i, image in enumerate(images.values()):
-        kinds = image.flatten(2).long().clamp(max=CELL_KINDS - 1)
+        kinds = image.flatten(2).long().clamp(max=CELL_KINDS - 1)  # 16 and more are one kind
         one_hot = torch.nn.functional.one_hot(kinds, CELL_KINDS).flatten(2).float()
         dense.append(torch.relu(one_hot @ views[f"{i}.weight"] + views[f"{i}.bias"]))
+    features, by_hand = encoder(views, images), torch.cat(dense, -1)
+    assert features.shape == (members, batch, encoder.size)
+    torch.testing.assert_close(features, by_hand, rtol=1e-4, atol=1e-4)
     grad = torch.randn(members, batch, 2 * CELL_FEATURES, generator=rng)
-    found, want = (
-        torch.autograd.grad(features, list(views.values()), grad)
-        for features in (encoder(views, images), torch.cat(dense, -1))
-    )
+    found, want = (torch.autograd.grad(x, list(views.values()), grad) for x in (features, by_hand))
     for mine, plain in zip(found, want, strict=True):
         torch.testing.assert_close(mine, plain, rtol=1e-4, atol=1e-4)
 

@@ -1,9 +1,6 @@
 from dataclasses import replace
 
-import pytest
-
 from skillweave import PPO, Hierarchy, Skill, TrainDefaults
-from skillweave.errors import DeclarationError
 from skillweave.networks.config import CNN, Network
 
 
@@ -12,19 +9,6 @@ class Upright(Skill):
 
     def reward(self, step):
         return 1.0 - abs(step.next_obs[:, 2])
-
-
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
-        (lambda: Network(sees=(0,), encoder="cells"), r"Network: give sees or encoder, not both"),
-        (lambda: CNN("plain", (), (), ()), r"CNN\.channels is \(\).*at least one layer"),
-        (lambda: CNN(strides=(4, 2)), r"CNN\.channels, kernels and strides have 3, 3 and 2"),
-    ],
-)
-def test_an_architecture_that_cannot_be_is_named_with_what_it_must_be(make, says):
-    with pytest.raises(DeclarationError, match=says):
-        make()
 
 
 def test_presets_are_what_they_are_called():

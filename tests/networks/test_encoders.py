@@ -13,7 +13,7 @@ from toys import Echo, drawn, learn
 from skillweave.algorithms import register_encoder
 from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.config import DQN, PPO
-from skillweave.errors import DeclarationError, SkillweaveError
+from skillweave.errors import SkillweaveError
 from skillweave.networks import encoders
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.encoders import ImageEncoder
@@ -112,13 +112,6 @@ def test_the_usual_network_depends_on_the_size(height, width, chosen, size):
     assert encoder.size == size
 
 
-def test_an_image_that_is_too_small_is_an_error_that_names_sizes():
-    with pytest.raises(DeclarationError) as error:
-        ImageEncoder(obs_codec(image_space(20, 24)), 0, CNN(), "relu")
-    for said in ("(3, 20, 24)", "layer 2 has a kernel of 3", "only 1 x 1 are left", "CNN.small()"):
-        assert said in str(error.value)
-
-
 def test_images_and_vectors_of_a_dict_are_joined():
     space = Dict(a=image_space(8, 8), b=image_space(6, 6, 1), c=Box(-1, 1, (3,), np.float32))
     obs = obs_codec(space)
@@ -191,16 +184,6 @@ def test_a_registered_encoder_learns_saves_and_loads(name):
     encoders._REGISTERED.clear()
     with pytest.raises(SkillweaveError, match=r"Network\.encoder is 'halves', which is"):
         AgentPolicy.from_file(*policy.to_file(), "agent")
-
-
-@pytest.mark.usefixtures("_halves")
-def test_an_encoder_that_nobody_registered_names_those_that_are():
-    with pytest.raises(DeclarationError) as error:
-        Net("net", obs_codec(image_space()), Network(encoder="wholes"), 2)
-    call = "call skillweave.algorithms.register_encoder('wholes', ...)"
-    said = f"'wholes', which is not registered: {call}"
-    assert said in str(error.value)
-    assert "registered: halves" in str(error.value)
 
 
 @pytest.mark.usefixtures("_halves")

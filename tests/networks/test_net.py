@@ -104,11 +104,7 @@ def test_noisy_weights_are_means_and_scaled_factorised_noise():
                 found[f"{layer}.bias"][m, 0], bias + spread[1] * torch.tensor(own[n_in:])
             )
 
-
-def test_without_noise_the_means_act():
-    net, layout, flat = noisy_net()
-    views = layout.views(flat)
-    still = net.perturbed(views, torch.zeros(P, net.noise_size))
+    still = net.perturbed(views, torch.zeros(P, net.noise_size))  # the means act
     assert torch.equal(net(still, inputs()), net(views, inputs()))
     plain = {k: v for k, v in views.items() if "sigma" not in k}
     assert torch.equal(net(plain, inputs()), net(views, inputs()))
@@ -229,28 +225,22 @@ def test_parts_of_a_tuple_have_their_places_as_keys():
 
 
 @pytest.mark.parametrize(
-    ("sees", "says"),
-    [
-        ("leg", r"names 'leg', a part of the observation that does not exist.*arm\.joints.*speed"),
-        ("arm.joint", r"names 'arm.joint', a part .*does not exist.*'?arm\.joints"),
-        ("camera", "names 'camera', an image, and images are always seen: leave it out"),
-        (("arm", 3), "names a number twice"),
-        ((9,), r"names the number 9 of an observation, but it has 9 \(0 to 8\)"),
-    ],
-)
-def test_parts_that_are_not_there_are_named(sees, says):
-    with pytest.raises(DeclarationError, match=says):
-        make_algorithm(PPO(network=Network(sees=sees)), ROBOT, Discrete(2))
-
-
-@pytest.mark.parametrize(
     ("sees", "space", "says"),
     [
+        (
+            "leg",
+            ROBOT,
+            r"names 'leg', a part of the observation that does not exist.*arm\.joints.*speed",
+        ),
+        ("arm.joint", ROBOT, r"names 'arm.joint', a part .*does not exist.*'?arm\.joints"),
+        ("camera", ROBOT, "names 'camera', an image, and images are always seen: leave it out"),
+        (("arm", 3), ROBOT, "names a number twice"),
+        ((9,), ROBOT, r"names the number 9 of an observation, but it has 9 \(0 to 8\)"),
         ("speed", Box(-1, 1, (3,)), r"names 'speed'.*does not exist; it has no parts"),
         ((3, 1), Box(0, 255, (12, 12, 3), np.uint8), "3 .* has no number beside its images"),
     ],
 )
-def test_an_observation_without_parts_or_numbers_says_so(sees, space, says):
+def test_parts_that_are_not_there_are_named(sees, space, says):
     with pytest.raises(DeclarationError, match=says):
         make_algorithm(PPO(network=Network(sees=sees)), space, Discrete(2))
 
@@ -261,8 +251,3 @@ def test_images_are_seen_beside_the_numbers():
     shapes = Net("pi", obs_codec(both), Network((8,), cnn=cnn, sees=(2,)), A).shapes
     alone = Net("pi", obs_codec(both["camera"]), Network((8,), cnn=cnn), A).shapes
     assert shapes["pi.0.weight"][0] == alone["pi.0.weight"][0] + 1
-
-
-def test_what_is_seen_survives_json():
-    config = PPO(network=Network(sees=(3, 1)))
-    assert config_from_json(json.loads(json.dumps(config_to_json(config)))) == config

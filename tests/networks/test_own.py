@@ -237,8 +237,9 @@ SOLVED = ("ppo", "dqn")
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("shows", ["vector", "image, channels last"])
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize(
+    ("name", "shows"), [*((name, "vector") for name in LEARNERS), ("ppo", "image, channels last")]
+)
 def test_it_learns_saves_and_loads_with_every_algorithm(name, shows):
     config, asks, budget = LEARNERS[name]
     factory = Features if shows == "vector" else Camera
@@ -438,17 +439,3 @@ def test_what_is_no_factory_is_a_sentence():
     ):
         with pytest.raises(DeclarationError, match=says):
             make_encoder(Network(encoder=value).encoder, obs_codec(Box(-1.0, 1.0, (4,))))
-
-
-def test_lists_and_dicts_are_taken_for_what_they_say():
-    assert Network(hidden=[64, 32]) == Network((64, 32))
-    made = PPO(network={"hidden": [8], "rnn": {"kind": "gru", "size": 4}})
-    assert made.network == Network((8,), rnn=RNN("gru", 4))
-    assert SAC(critic={"hidden": [9]}).critic == Network((9,))
-    assert Network(cnn={"channels": [4], "kernels": [3], "strides": [1]}).cnn == sw.algorithms.CNN(
-        "plain", (4,), (3,), (1,)
-    )
-    with pytest.raises(DeclarationError, match=r"PPO\.network: .*'hiden'.*'hidden' meant"):
-        PPO(network={"hiden": [8]})
-    with pytest.raises(DeclarationError, match=r"DQN\.network: Network\.hidden\[0\] is 0"):
-        DQN(network={"hidden": [0]})

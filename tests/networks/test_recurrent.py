@@ -47,16 +47,6 @@ def one(torchs: nn.Module, kind: str, x, memory):
 
 
 @pytest.mark.parametrize("kind", ["lstm", "gru"])
-def test_a_cell_is_torchs(kind):
-    rnn, layout, flat, x, memory, _ = made(kind)
-    views = layout.views(flat)
-    after = rnn_step(views, "rnn", rnn, rnn_gates(views, "rnn", x[:, 0]), memory)
-    for m in range(P):
-        expected = one(reference(kind, views, m), kind, x[m, 0], memory[m])
-        torch.testing.assert_close(after[m], expected)
-
-
-@pytest.mark.parametrize("kind", ["lstm", "gru"])
 def test_a_sequence_is_torchs_cell_step_by_step_from_nothing_where_an_episode_starts(kind):
     rnn, layout, flat, x, memory, start = made(kind)
     views = layout.views(flat)

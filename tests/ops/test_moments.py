@@ -16,12 +16,9 @@ X = torch.tensor([[1.0, NAN, 3.0, 8.0], [NAN, NAN, NAN, NAN]])
 VALID = torch.tensor([[1, 0, 1, 1], [0, 0, 0, 0]], dtype=torch.bool)
 
 
-def test_the_mean_of_valid_samples_by_hand():
+def test_mean_and_variance_of_valid_samples_by_hand():
     assert masked_mean(X, VALID).tolist() == [4.0, 0.0]
     assert masked_mean(torch.tensor([[[1.0, 2.0], [3.0, 6.0]]])).tolist() == [3.0]
-
-
-def test_their_variance_by_hand():
     variance, mean = masked_var_mean(X, VALID)
     assert mean.tolist() == [4.0, 0.0]
     assert variance[0].item() == pytest.approx((9 + 1 + 16) / 3)

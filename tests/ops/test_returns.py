@@ -12,26 +12,6 @@ def one(*numbers: float) -> torch.Tensor:
     return torch.tensor(numbers).reshape(1, -1, 1)
 
 
-def advantages(reward, discount, value, next_value, last, lam=0.5):
-    a = gae(
-        one(*reward), one(*discount), one(*value), one(*next_value), one(*last), torch.tensor([lam])
-    )
-    assert a.shape == (1, len(reward), 1)
-    return a.flatten().tolist()
-
-
-def test_gae_bootstraps_a_truncation_and_cuts_the_trace_there():
-    # δ₀ = 1 + 0.9·10 − 4 = 6, and nothing of step 1, which belongs to another episode
-    got = advantages([1.0, 2.0], [0.9, 0.9], [4.0, 5.0], [10.0, 20.0], [True, True])
-    assert got == pytest.approx([6.0, 15.0])
-
-
-def test_gae_uses_the_discount_of_each_call():
-    # A call of τ = 3 steps: 0.9³ = 0.729. δ₁ = 0 + 0.9·10 − 2 = 7; δ₀ = 1 + 0.729·2 − 0 = 2.458
-    got = advantages([1.0, 0.0], [0.729, 0.9], [0.0, 2.0], [2.0, 10.0], [False, True])
-    assert got == pytest.approx([2.458 + 0.729 * 0.5 * 7.0, 7.0])
-
-
 def test_gae_of_another_policy_than_the_one_that_acted():
     # δ₁ = 2 − 5 = −3, δ₀ = 1 + 0.9·5 − 4 = 1.5; of row 1 a quarter counts: 1.5 + 0.45·0.25·(−3)
     rows = one(1.0, 2.0), one(0.9, 0.0), one(4.0, 5.0), one(5.0, 99.0), one(False, True)
@@ -48,8 +28,9 @@ def test_gae_of_another_policy_than_the_one_that_acted():
 
 def test_gae_ignores_the_next_value_where_the_discount_is_zero_even_if_it_is_not_a_number():
     # A physics engine may well terminate *because* its last observation is not finite.
-    got = advantages([1.0, 2.0], [0.9, 0.0], [4.0, 5.0], [5.0, float("nan")], [False, True])
-    assert got == pytest.approx([0.15, -3.0], abs=1e-6)
+    rows = one(1.0, 2.0), one(0.9, 0.0), one(4.0, 5.0), one(5.0, float("nan")), one(False, True)
+    found = gae(*rows, torch.tensor([0.5]))
+    assert found.flatten().tolist() == pytest.approx([0.15, -3.0], abs=1e-6)
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -78,20 +78,17 @@ def test_a_skill_ends_where_it_is_done_and_is_paid_for_it(name, before, action, 
         assert skill.reward(step) == pytest.approx(done - 0.02)
 
 
-def test_a_skill_that_shuts_a_door_pays_for_it():
-    shuts = step_of(view(OPEN), view(CLOSED), world.TOGGLE)
-    turns = step_of(view(OPEN), view(CLOSED), world.LEFT)  # to another door, which is shut
-    sees = 0.04 * (world.FAR - 1)  # a shut door is one step away now, and none was in view
-    assert SKILLS["open_door"].reward(shuts) == pytest.approx(-1.02)
-    assert SKILLS["open_door"].reward(turns) == pytest.approx(sees - 0.02)
-
-
-def test_a_skill_is_paid_for_each_cell_that_it_comes_nearer():
+def test_a_skill_is_paid_for_each_cell_that_it_comes_nearer_and_pays_for_a_door_that_it_shuts():
     far, near = view(far=GOAL), view(ahead=GOAL)  # two to the left and four ahead; one ahead
     reward = SKILLS["reach_goal"].reward
     assert reward(step_of(far, near)) == pytest.approx(5 * 0.04 - 0.02)
     assert reward(step_of(near, far)) == pytest.approx(-5 * 0.04 - 0.02)
     assert reward(step_of(near, view())) == pytest.approx(-(world.FAR - 1) * 0.04 - 0.02)
+    shuts = step_of(view(OPEN), view(CLOSED), world.TOGGLE)
+    turns = step_of(view(OPEN), view(CLOSED), world.LEFT)  # to another door, which is shut
+    sees = 0.04 * (world.FAR - 1)  # a shut door is one step away now, and none was in view
+    assert SKILLS["open_door"].reward(shuts) == pytest.approx(-1.02)
+    assert SKILLS["open_door"].reward(turns) == pytest.approx(sees - 0.02)
 
 
 def test_explore_ends_where_there_is_something_to_do():
@@ -175,17 +172,13 @@ def test_a_step_is_what_each_agents_room_makes_of_it():
     assert len(seen) > 30
 
 
-def test_a_task_pays_one_however_long_it_took():
+def test_rooms_are_drawn_anew_for_each_episode_and_pay_one_however_long_it_took():
     pytest.importorskip("minigrid")
     env = world.Rooms(("Empty-5x5",))
     env.reset(seed=0)
     paid = [env.step(a) for a in (2, 2, 1, 2, 2)]
     assert [p[1] for p in paid] == [0.0, 0.0, 0.0, 0.0, 1.0]
     assert paid[-1][2]
-
-
-def test_rooms_are_drawn_anew_for_each_episode():
-    pytest.importorskip("minigrid")
     env = world.Rooms(world.SMALL)
     drawn = [env.reset(seed=s)[0] for s in (0, *[None] * 40)]
     assert drawn[0].shape == world.SPACE.shape

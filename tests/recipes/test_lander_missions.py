@@ -12,7 +12,6 @@ from toys import SideBySide
 
 from benchmarks.pay.lander_missions import suite
 from skillweave import Apart, EnvSpec, Selection
-from skillweave.errors import DeclarationError
 from skillweave.recipes import _missions as world, lander_missions as missions
 
 LEFT, RIGHT, ABOVE, PAD = (-0.5, 0.75), (0.5, 0.75), (0.0, 0.6), (0.1, 0.0)
@@ -47,12 +46,6 @@ def test_each_leg_of_a_tour_pays_a_third_in_its_order():
     assert not progress.done(ONE)
 
 
-def test_the_edge_of_a_box_belongs_to_it():
-    assert fly(("left", "land"), [(-0.35, 0.75)])[0] == [0.5]
-    assert fly(("left", "land"), [(-0.34, 0.75)])[0] == [0.0]
-    assert fly(("left", "land"), [(-0.5, 0.91)])[0] == [0.0]
-
-
 def test_hovering_takes_two_seconds_without_leaving_the_box():
     enough = world.HOVER_STEPS
     paid, _ = fly(("hover", "land"), [ABOVE] * enough + [ABOVE])
@@ -62,10 +55,19 @@ def test_hovering_takes_two_seconds_without_leaving_the_box():
     assert progress.held == [3]
 
 
-def test_a_landing_counts_only_at_rest_and_on_the_pad():
-    assert fly(("land",), [PAD, PAD])[0] == [0, 0]
-    assert fly(("land",), [SKY, PAD], rested=True)[0] == [0, 1]
-    assert fly(("land",), [SKY, (0.21, 0.0)], rested=True)[0] == [0, 0]
+@pytest.mark.parametrize(
+    ("mission", "places", "rested", "paid"),
+    [
+        (("left", "land"), [(-0.35, 0.75)], False, [0.5]),  # the edge of a box belongs to it
+        (("left", "land"), [(-0.34, 0.75)], False, [0.0]),
+        (("left", "land"), [(-0.5, 0.91)], False, [0.0]),
+        (("land",), [PAD, PAD], False, [0, 0]),  # a landing counts only at rest
+        (("land",), [SKY, PAD], True, [0, 1]),
+        (("land",), [SKY, (0.21, 0.0)], True, [0, 0]),
+    ],
+)
+def test_a_leg_is_done_in_its_box_and_a_landing_at_rest(mission, places, rested, paid):
+    assert fly(mission, places, rested)[0] == paid
 
 
 def test_what_is_still_to_be_done_stands_in_the_observation():
@@ -74,12 +76,6 @@ def test_what_is_still_to_be_done_stands_in_the_observation():
     np.testing.assert_array_equal(seen[:8], lander(ABOVE))
     np.testing.assert_array_equal(seen[8:20], [0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0])
     assert seen[20] == 0.25
-
-
-@pytest.mark.parametrize("legs", [(), ("left",) * 4, ("left", "up")])
-def test_missions_that_there_are_not_are_refused(legs):
-    with pytest.raises(DeclarationError, match="a mission has 1 to 3 legs of left, right, hover"):
-        world.MissionState(1, [legs], gusts=False)
 
 
 def test_gusts_fire_the_engines_of_alternating_sides():
@@ -280,13 +276,6 @@ def test_skills_sample_and_a_selector_over_given_skills_takes_fewer_steps():
     assert (longer.selection.greedy_skills, longer.apart.selector_steps) == (True, 500_000)
 
 
-def test_the_selector_by_hand_calls_the_skill_of_the_leg():
-    progress = world.MissionState(4, [(kind,) for kind in world.KINDS], gusts=False)
-    progress.left[:, 0] = np.arange(4)
-    obs = progress.seen(np.stack([lander(SKY)] * 4), np.arange(4))
-    assert missions.by_leg(obs).tolist() == ["go_left", "go_right", "hover", "land"]
-
-
 def test_the_selector_by_hand_chooses_a_skill_that_may_start_on_any_mission():
     every = [m for n in (1, 2, 3) for m in itertools.product(world.KINDS, repeat=n)]
     skills = {skill().name: skill() for skill in missions.SKILLS}
@@ -368,10 +357,3 @@ def test_landers_in_envpool_and_in_gymnasium_have_the_same_missions():
     assert terminated
     assert not info["success"]
     assert reward == 0.0
-
-
-def test_a_mission_has_no_threshold_of_landers_own_reward():
-    pytest.importorskip("Box2D")
-    with missions.declare().spec.make() as env:
-        assert env.spec.reward_threshold is None
-        assert env.spec.max_episode_steps == 1000

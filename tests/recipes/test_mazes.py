@@ -72,9 +72,7 @@ def test_the_map_says_where_ball_and_goal_are_between_its_points():
     assert goal[0, -1] == 1.0
     assert goal.sum() == 1.0
     np.testing.assert_allclose(seen[0, -4:], [1.0, 0.0, -1.25, 2.0], atol=1e-6)
-
-
-def test_skills_see_the_same_wherever_the_maze_is():
+    # Skills see the same wherever the maze is.
     here, there = ball(), ball(place=(2.0, -1.0), goal=(5.0, 3.0))
     np.testing.assert_array_equal(
         encoded(mazes.Motion(None), here), encoded(mazes.Motion(None), there)

@@ -99,7 +99,9 @@ def test_two_recipes_with_files_of_one_name_are_refused_and_not_mixed(write: Wri
     assert sys.modules[type(one.skills[0]).__module__].__file__ == first
 
 
-def test_files_that_one_another_import_are_looked_at_too(write: Write) -> None:
+def test_files_that_one_another_import_and_files_named_like_a_package_are_looked_at_too(
+    write: Write,
+) -> None:
     plain = RECIPE.replace("        from beside_lazily import scale\n", "        scale = 1\n")
     recipes.load(write("a", pole=plain, beside_rewards=REWARDS))
     more = "import beside_rewards\n"
@@ -107,12 +109,9 @@ def test_files_that_one_another_import_are_looked_at_too(write: Write) -> None:
     write("b", beside_rewards=REWARDS)
     with pytest.raises(DeclarationError, match="imports 'beside_rewards'"):
         recipes.load(second)
-
-
-def test_a_file_named_like_a_package_is_refused_only_where_it_is_imported(write: Write) -> None:
     unrelated = RECIPE.replace("from beside_rewards import centre", "centre = abs")
-    recipes.load(write("a", pole=unrelated, json="raise ValueError\n"))
-    recipe = write("b", pole="import json\n" + unrelated, json="x = 1\n")
+    recipes.load(write("c", pole=unrelated, json="raise ValueError\n"))
+    recipe = write("d", pole="import json\n" + unrelated, json="x = 1\n")
     with pytest.raises(DeclarationError, match=r"imports 'json': beside it lies json.py"):
         recipes.load(recipe)
 

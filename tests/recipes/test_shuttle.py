@@ -9,7 +9,6 @@ from single_step import step_of
 from toys import SideBySide
 
 from benchmarks.pay.shuttle import POINTS, suite as shuttle_suite
-from skillweave import SkillweaveError
 from skillweave.recipes import _cheetah as cheetah, shuttle
 
 COST = -0.25
@@ -52,34 +51,35 @@ def run(points, places):
     return rewards, legs
 
 
-def test_a_round_of_the_papers_task_pays_a_thousand_at_its_end_and_nothing_between():
-    places = [1.0, 2.0, 2.1, 5.0, -2.0, -2.1, -3.0, 3.0, -9.0]
-    rewards, legs = run((2.0, -2.0), places)
+PAYS = 1000.0
+ROUNDS = {
     # The point itself is not beyond it. The step that pays costs no effort, as in the paper.
-    assert rewards == [COST, COST, COST, COST, COST, 1000.0, COST, COST, 1000.0]
-    assert legs == [0, 0, 1, 1, 1, 0, 0, 1, 0]
+    "the paper's": (
+        (2.0, -2.0),
+        [1.0, 2.0, 2.1, 5.0, -2.0, -2.1, -3.0, 3.0, -9.0],
+        [COST, COST, COST, COST, COST, PAYS, COST, COST, PAYS],
+        [0, 0, 1, 1, 1, 0, 0, 1, 0],
+    ),
+    "it begins beyond a point of a later leg, which has to wait": (
+        (2.0, -2.0),
+        [-3.0, -3.0, 3.0],
+        [COST, COST, COST],
+        [0, 0, 1],
+    ),
+    "each of three points is passed in its direction": (
+        (2.0, 6.0, -2.0),
+        [3.0, 5.0, 7.0, 1.0, -3.0, 3.0],
+        [COST, COST, COST, COST, PAYS, COST],
+        [1, 1, 2, 2, 0, 1],
+    ),
+    "one step passes one point at most": ((2.0, 6.0, -2.0), [7.0, 7.0], [COST, COST], [1, 2]),
+}
 
 
-def test_where_it_begins_beyond_a_point_of_a_later_leg_that_leg_still_has_to_wait():
-    rewards, legs = run((2.0, -2.0), [-3.0, -3.0, 3.0])
-    assert rewards == [COST] * 3
-    assert legs == [0, 0, 1]
-
-
-def test_a_patrol_of_three_points_passes_each_in_its_direction():
-    rewards, legs = run((2.0, 6.0, -2.0), [3.0, 5.0, 7.0, 1.0, -3.0, 3.0])
-    assert rewards == [COST, COST, COST, COST, 1000.0, COST]
-    assert legs == [1, 1, 2, 2, 0, 1]
-
-
-def test_one_step_passes_one_point_at_most():
-    assert run((2.0, 6.0, -2.0), [7.0, 7.0])[1] == [1, 2]
-
-
-@pytest.mark.parametrize("points", [(2.0,), (1.0, 1.0), (1.0, 2.0, 3.0, 4.0), (1.0, 2.0, 2.0)])
-def test_points_that_make_no_patrol_are_refused(points):
-    with pytest.raises(SkillweaveError, match="a patrol has 2 to 3 points"):
-        cheetah.Patrol(Runner([]), points)
+@pytest.mark.parametrize("name", ROUNDS)
+def test_a_round_pays_a_thousand_at_its_end_and_nothing_between(name):
+    points, places, rewards, legs = ROUNDS[name]
+    assert run(points, places) == (rewards, legs)
 
 
 def seen(x, leg):
@@ -126,10 +126,6 @@ def test_x_is_seen_from_the_point_that_is_run_to():
     assert cheetah.from_log(np.array([obs[cheetah.X] for obs in seen])) == pytest.approx(metres)
 
 
-def test_its_name_says_how_x_is_seen_so_that_runs_that_saw_metres_are_refused():
-    assert shuttle.declare().spec.name == "Shuttle(2, -2; log x)"
-
-
 def test_a_pool_of_patrols_sees_and_pays_as_each_patrol_alone():
     points, places = (2.0, 6.0, -2.0), ([3.0, 7.0, -3.0, 3.0], [1.0, 3.0, 5.0, 7.0])
     pool = cheetah.Patrols(SideBySide([Runner(p) for p in places]), 2, points)
@@ -168,32 +164,22 @@ def test_envpools_half_cheetah_moves_as_gymnasiums():
     assert legs == {0, 1}
 
 
-def test_skills_see_all_but_the_leg():
-    everything = set(range(21))
+def test_what_is_declared():
+    everything, declared = set(range(21)), shuttle.declare()
     assert everything - set(shuttle.RUNNER.network.sees) == set(range(21)[cheetah.LEG])
     assert shuttle.SELECTOR.network.sees is None
-    assert shuttle.declare().plain_agent().algorithm.network.sees is None
-
-
-def test_calls_by_lot_become_few_long_before_the_end():
-    (stage,) = shuttle.declare().stages()
+    assert declared.plain_agent().algorithm.network.sees is None
+    # Its name says how x is seen, so that runs that saw metres are refused.
+    assert declared.spec.name == "Shuttle(2, -2; log x)"
+    (stage,) = declared.stages()  # calls by lot become few long before the end
     config = stage.config
     assert (config.epsilon, config.epsilon_final, config.epsilon_fraction) == (0.95, 0.05, 0.4)
-
-
-def test_the_protocol_trains_in_as_many_processes_as_the_recipe():
-    tasks, suite = POINTS, shuttle_suite()
+    # The protocol trains in as many processes as the recipe.
+    suite = shuttle_suite()
     ready = dict.fromkeys(("forward", "backward", "stop"), lambda obs: np.zeros((len(obs), 6)))
-    found = [suite.hierarchy(suite.task(n), ready if i else None) for i, n in enumerate(tasks)]
+    found = [suite.hierarchy(suite.task(n), ready if i else None) for i, n in enumerate(POINTS)]
     assert [h.spec.workers for h in found] == [shuttle.COLLECTORS, 1, 1, 1]
-    assert shuttle.declare().spec.workers == shuttle.COLLECTORS == 2
-
-
-def test_a_patrol_has_no_threshold_of_the_half_cheetahs_own_reward():
-    pytest.importorskip("mujoco")
-    with shuttle.declare().spec.make() as env:
-        assert env.spec.reward_threshold is None
-        assert env.spec.max_episode_steps == 1000
+    assert declared.spec.workers == shuttle.COLLECTORS == 2
 
 
 @pytest.mark.parametrize("points", list(POINTS.values()))

@@ -89,6 +89,9 @@ def test_speed_is_the_recent_one(clock, capsys):
     lines = capsys.readouterr().err.splitlines()
     assert lines[-2] == "landing: 62,000 of 100,000 steps (62%), 2,000 steps/s, 0:19 left"
     assert lines[-1] == "landing: 72,000 of 100,000 steps (72%), 500 steps/s, 0:56 left"
+    with Progress() as progress:
+        progress.done("center", 5_000, 7322.0, {"return": -1.25})  # it had no start
+    assert "return -1.2, 1 steps/s, done in 2:02:02" in capsys.readouterr().err
 
 
 TOGETHER = {
@@ -111,12 +114,6 @@ def test_everyone_who_learns_in_a_stage_has_a_line_at_its_end(clock, capsys):
         "  inner/right: 75% of steps, reward -1.5 a step",
         "  idle: 0% of steps",
     ]
-
-
-def test_a_stage_done_without_a_start(capsys):
-    with Progress() as progress:
-        progress.done("landing", 5_000, 7322.0, {"return": -1.25})
-    assert "return -1.2, 1 steps/s, done in 2:02:02" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("on_terminal", [False, True])

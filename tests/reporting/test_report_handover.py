@@ -106,22 +106,18 @@ def test_only_calls_whose_episodes_are_whole_are_played_again(log):
     assert all(cell["clips"] == [] for cell in made.data["handover"]["cells"].values())
 
 
-def test_an_environment_that_does_another_thing_is_not_filmed(log, monkeypatch):
+def test_what_does_not_fit_the_environment_is_not_filmed(log, monkeypatch):
+    made = section(replace(log, action=log.action + 7))  # a log from elsewhere may hold anything
+    assert "the log has the action" in made.missing[0]
+    assert made.context["hand_film"] is None
+    other = gym.spaces.Discrete(3)
+    made = section(replace(log, action_space=other))
+    assert "the log has actions of Discrete(3)" in made.missing[0]
     monkeypatch.setattr(Ragged, "mood", 1)
     made = section(log)
     assert made.context["hand_film"] is None
     assert "it does not repeat itself" in made.missing[0]
     assert made.missing[0].startswith("There is no film of handovers: ")
-
-
-def test_a_log_from_elsewhere_may_hold_anything(log):
-    made = section(replace(log, action=log.action + 7))
-    assert "the log has the action" in made.missing[0]
-    assert made.context["hand_film"] is None
-    other = gym.spaces.Discrete(3)
-    assert (
-        "the log has actions of Discrete(3)" in section(replace(log, action_space=other)).missing[0]
-    )
 
 
 def test_few_points_and_a_short_film_of_many_calls(log, monkeypatch):
@@ -132,15 +128,13 @@ def test_few_points_and_a_short_film_of_many_calls(log, monkeypatch):
     assert max(map(len, data["points"].values())) <= 60 // len(data["points"]) + 1
     assert sum(len(cell["clips"]) for cell in data["cells"].values()) in (1, 2, 3)
     assert data["names"] == ["obs[0]", "obs[1]"]
-
-
-def test_a_log_of_images_has_no_chart(log):
+    # Images have no chart.
     flat = {name: np.zeros((*getattr(log, name).shape[:1], 70), np.float32)
             for name in ("start", "next_obs")}  # fmt: skip
     space = gym.spaces.Box(-1, 1, (70,), np.float32)
-    data = section(replace(log, observation_space=space, **flat), filmed=False)
-    assert data.data["handover"]["names"] == []
-    assert data.context["handover"]["where"] == []
+    made = section(replace(log, observation_space=space, **flat), filmed=False)
+    assert made.data["handover"]["names"] == []
+    assert made.context["handover"]["where"] == []
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from reporting.walkway import CALLS, Go, Stay, Walkway, choose, declare, played,
 from small_runs import stage_entry
 
 from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
+from skillweave.envs.obs_names import GYMNASIUM
 from skillweave.reporting.report import timelines
 from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.facts import about, no_verdict, number, percent, verdict
@@ -171,6 +172,8 @@ def test_reflexes_are_counted_by_hand(tmp_path):
     assert found.to_json()["reflexes"]["later"] == {"steps": 3, "share": 3 / 24}
     # A skill alone is overridden, too.
     assert run.evaluate(1, skill="go").reflexes["later"] == 1
+    found = run.evaluate(2, save=True)
+    assert run.info()["evaluation"]["reflexes"] == found.to_json()["reflexes"]
 
 
 def test_reflexes_of_a_nested_hierarchy_have_paths_and_yield_to_those_above(
@@ -186,12 +189,6 @@ def test_reflexes_of_a_nested_hierarchy_have_paths_and_yield_to_those_above(
     found = outer.train(tmp_path / "outer", quiet=True).evaluate(2)
     told = {"mine": 2, "inner/hurry": 0, "inner/later": 0, "inner/never": 0}
     assert found.reflexes == told
-
-
-def test_an_evaluation_with_reflexes_is_saved_and_read(tmp_path):
-    run = reflexed(tmp_path)
-    found = run.evaluate(2, save=True)
-    assert run.info()["evaluation"]["reflexes"] == found.to_json()["reflexes"]
 
 
 # Docstrings
@@ -262,11 +259,6 @@ def test_names_come_from_the_spec_the_environment_or_gymnasium():
     assert EnvSpec(Named, obs_names=["a", "b"]) == EnvSpec(Named)
     names = EnvSpec("CartPole-v1").observation_names()
     assert names == ("cart position", "cart speed", "pole angle", "pole angular speed")
-
-
-def test_known_names_are_as_many_as_the_numbers_of_an_observation():
-    from skillweave.envs.obs_names import GYMNASIUM
-
     for env_id in ("Acrobot-v1", "CartPole-v1", "MountainCar-v0", "Pendulum-v1"):
         space = gym.make(env_id).observation_space
         assert (len(GYMNASIUM[env_id.rpartition("-v")[0]]),) == space.shape

@@ -32,14 +32,12 @@ def test_mujoco_is_told_to_draw_with_egl_meanwhile_where_it_is_installed(monkeyp
     assert not {"MUJOCO_GL", "SDL_VIDEODRIVER"} & os.environ.keys()
 
 
-def test_what_the_user_has_set_stays(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    with screen.without_screen():
+def test_what_the_user_has_set_stays_and_with_a_screen_nothing_is_set(monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setenv("MUJOCO_GL", "osmesa")
+        with screen.without_screen():
+            assert os.environ["MUJOCO_GL"] == "osmesa"
         assert os.environ["MUJOCO_GL"] == "osmesa"
-    assert os.environ["MUJOCO_GL"] == "osmesa"
-
-
-def test_with_a_screen_nothing_is_set(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(screen, "_has_egl", lambda: True)
     with screen.without_screen():

@@ -133,6 +133,8 @@ def test_without_a_network_a_run_is_loaded_as_it_was_downloaded(run, hub, tmp_pa
     go_to(NOWHERE, tmp_path / "empty", monkeypatch)
     with pytest.raises(RunError, match=r"cannot be reached.*no copy of ada/cart.*ConnectError"):
         sw.from_hub(NAME)
+    with pytest.raises(RunError, match=r"cannot be reached\. Nothing was pushed"):
+        run.push(NAME)
 
 
 # What is not loaded
@@ -159,12 +161,9 @@ def test_files_of_the_hub_are_checked_like_those_of_any_run(run, hub):
     hub.make("ada/cut", files | {"policies/left.safetensors": b"\0" * 20})
     with pytest.raises(RunError, match="damaged"):
         sw.from_hub("ada/cut")
-
-
-def test_what_is_no_run_is_said(hub):
-    hub.make(NAME, {"config.json": b"{}", "model.safetensors": b""})
-    with pytest.raises(RunError, match="ada/cart holds no run of Skillweave"):
-        sw.from_hub(NAME)
+    hub.make("ada/else", {"config.json": b"{}", "model.safetensors": b""})
+    with pytest.raises(RunError, match="ada/else holds no run of Skillweave"):
+        sw.from_hub("ada/else")
 
 
 def test_wrong_names_private_runs_and_revisions_are_told_with_what_to_do(run, hub, monkeypatch):
@@ -234,12 +233,6 @@ def test_where_the_hub_fails_nothing_is_half_pushed(run, hub):
     hub.breaks_at = ""
     run.push(NAME)
     assert same_actions(sw.from_hub(NAME), run)
-
-
-def test_no_network_is_told(run, tmp_path, monkeypatch):
-    go_to(NOWHERE, tmp_path / "cache", monkeypatch)
-    with pytest.raises(RunError, match=r"cannot be reached\. Nothing was pushed"):
-        run.push(NAME)
 
 
 def test_a_missing_library_names_its_extra(run, monkeypatch):

@@ -32,6 +32,7 @@ def change(path: Path, **fields):
 @pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("place", ["/home/ada/secret/", "C:\\ada\\secret\\", ""])
 def test_where_files_lie_and_who_tracks_a_run_does_not_go_up(place, run, hub):
+    left, right = run.info()["skills"]
     change(run.path, recipe=f"{place}still.py", track=("tensorboard",))
     here = files_of(run.path)
     run.push(NAME)
@@ -42,11 +43,8 @@ def test_where_files_lie_and_who_tracks_a_run_does_not_go_up(place, run, hub):
     assert not [name for name, data in there.items() if b"secret" in data]
     assert files_of(run.path) == here
     assert same_actions(sw.from_hub(NAME), run)  # its checksums hold
-
-
-def test_nor_does_where_a_ready_policy_lies(run, hub):
-    left, right = run.info()["skills"]
-    source = {"kind": "onnx", "file": "/home/ada/secret/hop.onnx", "sha256": "0" * 64}
+    # Nor does where a ready policy lies.
+    source = {"kind": "onnx", "file": f"{place}hop.onnx", "sha256": "0" * 64}
     change(run.path, skills=[left | {"policy": source}, right])
     run.push(NAME)
     there = hub.files(NAME)

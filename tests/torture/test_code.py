@@ -25,9 +25,6 @@ def test_many_are_drawn_in_portions_each_with_a_seed_of_its_own(monkeypatch, cap
     assert (found.counts, found.bad) == ({"refused": 24, "TRACEBACK": 1}, 1)
     assert drawn == [(1_000, 4), (1_000, 5), (300, 6)]
     assert "--seed 5: Case(y)" in capsys.readouterr().out
-
-
-def test_without_the_module_the_part_is_left_out_and_says_so(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "hostile", None)  # an import of it fails
     assert tally(9, 4) is None
     assert "left out" in capsys.readouterr().out

@@ -84,8 +84,16 @@ def test_every_kind_of_behaviour_is_told_apart(tmp_path, monkeypatch, category):
     assert found.bad == category.isupper()
 
 
-def test_what_a_change_asks_for_is_not_wrong(tmp_path):
+def test_what_a_change_asks_for_and_writing_into_its_own_folder_is_not_wrong(tmp_path):
     assert outcome(lambda folder, changed: {}, tmp_path, asks=True).category == ASKED
+
+    def write(folder, changed):
+        (folder / "new").mkdir()
+        (folder / "new" / "x").write_text("x")
+        shutil.rmtree(folder / "new")
+        return RIGHT
+
+    assert outcome(write, tmp_path).category == EQUAL
 
 
 def connect():
@@ -116,16 +124,6 @@ def test_code_that_runs_is_seen_even_if_the_reader_then_refuses(tmp_path, what):
         say(f"{case} is damaged")
 
     assert outcome(misbehave, folder).category == CODE
-
-
-def test_writing_into_the_case_s_own_folder_is_allowed(tmp_path):
-    def write(folder, changed):
-        (folder / "new").mkdir()
-        (folder / "new" / "x").write_text("x")
-        shutil.rmtree(folder / "new")
-        return RIGHT
-
-    assert outcome(write, tmp_path).category == EQUAL
 
 
 # Changes
