@@ -190,7 +190,7 @@ class EnvSpec:
         try:
             return self.env(render_mode=render_mode, **kwargs)
         except TypeError as error:
-            if kwargs and "render_mode" not in str(error):
+            if kwargs and "'render_mode'" not in str(error):
                 raise  # it is about kwargs
             raise EnvError(
                 f"{self.name} cannot be rendered: the function that makes it must take "

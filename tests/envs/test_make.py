@@ -122,5 +122,8 @@ def test_a_function_that_makes_environments_gets_kwargs_and_a_class_must_take_ho
         EnvSpec(short, kwargs={"longer": 7}).make()
     with pytest.raises(EnvError, match=r"short could not be made: TypeError.*'longer'"):
         EnvSpec(short, kwargs={"longer": 7}).make(render_mode="rgb_array")
+    short.__qualname__ = "with_render_mode"  # Python names the function in its error
+    with pytest.raises(EnvError, match=r"could not be made: TypeError.*'longer'"):
+        EnvSpec(short, kwargs={"longer": 7}).make(render_mode="rgb_array")
     with pytest.raises(EnvError, match=r"Bare cannot be rendered: .* must take render_mode"):
         EnvSpec(Bare).make(render_mode="rgb_array")
