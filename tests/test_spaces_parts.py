@@ -36,6 +36,7 @@ def pixels(*shape, dtype=BYTES, high=255):
         (pixels(84, 84, 4), (4, 84, 84)),
         (pixels(4, 84, 84), (4, 84, 84)),
         (pixels(3, 63, 48), (3, 63, 48)),
+        (pixels(10, 11, 4), (4, 10, 11)),  # few channels
         (pixels(42, 48, 12), (12, 42, 48)),
         (pixels(4, 32, 32, 3), (12, 32, 32)),
         (pixels(4, 4, 6), (6, 4, 4)),
