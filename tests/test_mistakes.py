@@ -662,12 +662,30 @@ def each(name: Any, *given: Any) -> Any:
     return lambda obs: (np.full(len(obs), name), *given) if given else np.full(len(obs), name)
 
 
-def options(actions: Any) -> Any:
+def options(actions: Any, space: Any = goals.SPACES["box"]) -> Any:
     """Take actions in an OptionsEnv of two environments."""
-    run = goals.declared([goals.go_to(), goals.Rest()]).train(quiet=True)
+    skills = [goals.go_to(goal_space=space, policy=goals.walk), goals.Rest()]
+    run = goals.declared(skills, selector=goals.rests).train(quiet=True)
     env = sw.envs.make_options_env(run, 2, 0.9)
     env.reset(seed=0)
     return env.step(actions)
+
+
+def draws(drawn: Any) -> None:
+    """Train a skill whose goals are drawn so."""
+    goals.declared([goals.go_to(goals=drawn)]).train(quiet=True)
+
+
+def player(goal: Any, space: str = "box", skill: Any = GO) -> sw.Player:
+    """Let a ready skill act for a goal."""
+    return goals.ready(space).player(skill=skill, goal=goal)
+
+
+def planned(task: Any, **done: Any) -> None:
+    """Plan for a task, or judge calls, on a log of calls that have goals."""
+    run = goals.ready()
+    log = run.log_calls(100)
+    log.handover(done=done) if done else run.plan(task, log)
 
 
 def sighted(sees: Any) -> None:
@@ -704,6 +722,7 @@ def automaton(transitions: Any) -> Any:
 
 
 TWO = {"at": np.zeros((1, 2)), "side": np.zeros(1, int)}
+TWICE = {"skill": np.zeros(2, int), "goal": {GO: np.array([[1, 1], [300, 1]])}}
 WIDE = {"skill": [0, 0], "goal": {GO: np.zeros((2, 3))}}
 IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     # Goals that a selector gives
@@ -742,6 +761,44 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ("SkillError", lambda: goes(at({"at": (0.5, 0.5), "byte": (300, 1)}), NESTED), "part 'byte'"),
     ("SkillError", lambda: goes(at({"at": (0.5, 0.5), "byte": (1.5, 1)}), NESTED), "whole numbers"),
     ("SkillError", lambda: goes(at({"at": (0.5, 0.5), "byte": (1, 2, 3)}), NESTED), "of shape"),
+    ("SkillError", lambda: options(TWICE, BYTES), "gave the goal [300, 1]"),
+    # Goals that a skill draws, and goals of one skill alone
+    ("SkillError", lambda: draws(lambda s, obs, rng: obs[0]), "shape (2,) for skill 'go_to'"),
+    ("SkillError", lambda: draws(lambda s, obs, rng: None), "goals() returned None"),
+    ("SkillError", lambda: draws(lambda s, obs, rng: obs.astype(str)), "goals() gave goals of <U"),
+    ("SkillError", lambda: draws(lambda s, obs, rng: obs + 7), "goals() gave the goal ["),
+    ("SkillError", lambda: draws(lambda s, obs, rng: obs.no), "goals() raised AttributeError"),
+    ("SkillError", lambda: player((5, 5)), "the player gave the goal"),
+    ("SkillError", lambda: player((0.5,)), "gave a goal of shape (1,) for skill 'go_to', but (2,)"),
+    ("SkillError", lambda: player((257, 0), "bits"), "gave the goal [257, 0], which is out of"),
+    ("SkillError", lambda: player({"at": (0, 0)}, "dict"), "a dict with 'at', 'side' was expected"),
+    ("SkillError", lambda: player({"at": (0, 5), "side": 1}, "dict"), "out of goal_space"),
+    ("SkillError", lambda: player({"at": (0,), "side": 1}, "dict"), "(1, 2) was expected"),
+    ("SkillError", lambda: player(3, "tuple"), "the player gave"),
+    ("DeclarationError", lambda: player((0, 0)).act(np.zeros((1, 2))), "without an axis"),
+    ("DeclarationError", lambda: player((0, 0), skill=None), "policy that takes none: name a"),
+    (
+        "SkillError",
+        lambda: goals.ready().evaluate(2, skill=GO, goal=(5, 5)),
+        "evaluate() gave the goal [5.0, 5.0]",
+    ),
+    (
+        "DeclarationError",
+        lambda: goals.ready().evaluate(2, skill="rest", goal=(0, 0)),
+        "skill 'rest' has no goals",
+    ),
+    ("DeclarationError", lambda: goals.ready().render("a.gif", goal=(0, 0)), "name it, skill="),
+    ("DeclarationError", lambda: goals.ready().evaluate(2).goals, 'evaluate(skill="go_to")'),
+    (
+        "DeclarationError",
+        lambda: goals.ready().evaluate(2, skill="rest").goals,
+        "no skill with goals acted alone",
+    ),
+    # A task knows no goal
+    ("SkillError", lambda: planned(GO), "step.goal: that is None here"),
+    ("SkillError", lambda: planned(lambda step: step.goal[:, 0] > 0), "None here"),
+    ("SkillError", lambda: planned(lambda step: step.next_obs > step.goal), "None here"),
+    ("SkillError", lambda: planned(None, go_to=lambda step: step.goal[:, 0] > 0), "None here"),
     # Goals in an OptionsEnv
     ("DeclarationError", lambda: options([0, 1]), "goals for 'go_to'"),
     (
@@ -773,6 +830,26 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ),
     (
         "DeclarationError",
+        lambda: fits(goals.go_to(goal_space=gym.spaces.Dict(at=POINT, word=gym.spaces.Text(4)))),
+        "the part word of the goal_space",
+    ),
+    (
+        "DeclarationError",
+        lambda: fits(goals.go_to(goal_space=gym.spaces.Text(4), policy=goals.walk)),
+        "is not supported",
+    ),
+    (
+        "DeclarationError",
+        lambda: fits(goals.go_to(goal_space=gym.spaces.Box(-1, 1, (0,)))),
+        "which holds no number: leave it out",
+    ),
+    (
+        "DeclarationError",
+        lambda: fits(goals.go_to(goal_space=gym.spaces.Dict({1: POINT}))),
+        "each with text as its name",
+    ),
+    (
+        "DeclarationError",
         lambda: fits(
             selector=goals.SELECTOR,
             guide=sw.Guide(sw.Automaton({"a": {(GO, (0.5, 0.5)), "rest"}}, {})),
@@ -784,6 +861,12 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ("DeclarationError", lambda: sighted(("observatoin", "goal")), "is 'observation' meant"),
     ("PolicyError", lambda: fits(goals.go_to(policy=lambda self, obs: obs)), "takes no goal"),
     ("DeclarationError", lambda: fits(goals.go_to(policy=lambda s, o: o)), "takes (s, o), which"),
+    ("PolicyError", lambda: fits(goals.go_to(policy=torch.nn.Linear(2, 2))), "write Goal() at its"),
+    (
+        "PolicyError",
+        lambda: fits(goals.go_to(policy=sw.train_agent(goals.Point, goals.ON, 100).policy)),
+        "has goals, but its policy observes Box",
+    ),
     # Parts and corrections
     ("DeclarationError", lambda: crane.crane([skill(policy=crane.crane(), acts=0)]), "no acts of"),
     ("DeclarationError", lambda: cranes(skill(), rest="hold"), "no skill writes a part"),

@@ -64,7 +64,7 @@ def test_interruption_with_goals_is_trained_and_resumed(learn, space, tmp_path):
     how = TOGETHER | {"learn": learn, "together": sw.Together(interrupt=True, margin=0.01)}
 
     def hierarchy():
-        return declared([Rest(), go_to(space)], steps=900, **how)
+        return declared([Rest(), go_to(space)], steps=600, **how)
 
     run = goes_on(hierarchy, tmp_path)
     critic = run.policy.skills.interruption.critic
@@ -76,7 +76,7 @@ def test_interruption_with_goals_is_trained_and_resumed(learn, space, tmp_path):
 
 def test_a_skill_with_goals_follows_the_task_too():
     def trained(weight):
-        hierarchy = declared([go_to(task_weight=weight), Rest()], steps=500, **TOGETHER)
+        hierarchy = declared([go_to(task_weight=weight), Rest()], steps=300, **TOGETHER)
         run = hierarchy.train(seed=1, quiet=True)
         return run.policy.skills.policies[0].weights
 
