@@ -28,6 +28,7 @@ import skillweave as sw
 from skillweave import recipes
 from skillweave._internal.messages import ELSEWHERE, RECORDINGS, STARTS
 from skillweave.algorithms.agent_policy import make_algorithm
+from skillweave.cli.overrides import apply_overrides
 from skillweave.envs import one_of
 from skillweave.envs.make import make_engine
 from skillweave.errors import KINDS, SkillError, SkillweaveError
@@ -637,6 +638,8 @@ def test_looking_for_a_forgotten_axis_does_not_change_training(
 # Goals, parts, corrections, and what is wrong with one argument alone
 
 POINT = goals.Point.observation_space
+TEXT, THOUSAND = gym.spaces.Text(3), gym.spaces.Box(0, 999, (1,), np.int64)
+ABSURD = gym.spaces.MultiDiscrete([2**60, 2**62])
 BYTES = gym.spaces.Box(0, 255, (2,), np.uint8)
 NESTED = gym.spaces.Dict({"at": gym.spaces.Box(-1, 1, (2,), np.float32), "byte": BYTES})
 GO = "go_to"
@@ -882,6 +885,16 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ("DeclarationError", lambda: sw.Residual(goals.Rest()), "is the skill 'rest'"),
     ("DeclarationError", lambda: sw.Residual(crane.Arm), "is the class Arm"),
     ("DeclarationError", lambda: sw.Residual(arm()), "a skill that learns, and no policy"),
+    (
+        "DeclarationError",
+        lambda: sw.Residual(crane.greedy([arm()]).as_skill("ready")),
+        "the skill 'ready', and no policy",
+    ),
+    (
+        "DeclarationError",
+        lambda: cranes(skill(policy=sw.Residual(crane.greedy([arm()])))),
+        "has a policy, but is none",
+    ),
     ("DeclarationError", lambda: cranes(skill(policy=arm())), "is the skill 'arm'"),
     (
         "DeclarationError",
@@ -911,6 +924,30 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ("DeclarationError", lambda: automaton([ended]), "transitions are"),
     ("DeclarationError", lambda: automaton({("a", "b"): "won"}), "has the event 'won'"),
     ("DeclarationError", lambda: bound(sw.Automaton({"a": "fly"}, {})), "state 'a' names 'fly'"),
+    ("DeclarationError", lambda: declare(selector=sw.Automaton), "an Automaton or a tree"),
+    (
+        "DeclarationError",
+        lambda: declare(selector=each("good"), selection=sw.Selection(target_return=1.0)),
+        "selector is ready",
+    ),
+    ("SkillError", lambda: declare(selector=each(7)).check_spaces(), "<lambda>() returned 7"),
+    (
+        "SkillError",
+        lambda: declare(
+            selector=sw.tree.Sequence(sw.tree.Condition(np.sign, "x"), "good")
+        ).check_spaces(),
+        "selector: tree: x() returned shape",
+    ),
+    (
+        "DeclarationError",
+        lambda: declare(selector=each("s"), skills=[skill(policy=zeros)], steps=None).plain_agent(),
+        "no part of this hierarchy is trained",
+    ),
+    (
+        "DeclarationError",
+        lambda: apply_overrides(declare(selector=each("good")), ["selector.gamma=0.5"]),
+        "selector.gamma: the selector is ready",
+    ),
     ("DeclarationError", lambda: sw.tree.Sequence(), "Sequence has no children"),
     ("DeclarationError", lambda: sw.tree.Fallback("a", 3), "has the child 3"),
     ("DeclarationError", lambda: sw.tree.Sequence(sw.tree.Fallback), "has the child <class"),
@@ -918,6 +955,49 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ("DeclarationError", lambda: bound(sw.tree.Sequence(ended)), "tree has no skill"),
     ("DeclarationError", lambda: sw.tree.Condition("a"), "Condition is 'a'"),
     ("DeclarationError", lambda: bound(sw.tree.Sequence("fly")), "leaf names 'fly'"),
+    # Skills and reflexes
+    ("DeclarationError", lambda: skill(name=5).validate(), "name is 5; it must be a text"),
+    ("DeclarationError", lambda: skill(reward=3).validate(), "reward is 3; it must be a method"),
+    ("DeclarationError", lambda: sw.Reflex(3, 0), "Reflex's condition is 3"),
+    ("DeclarationError", lambda: sw.Reflex(max, 0, 5), "Reflex's name is 5"),
+    ("DeclarationError", lambda: with_skill(policy="skill.onnx"), "from_onnx"),
+    ("DeclarationError", lambda: with_skill(policy=3), "is 3, which cannot act"),
+    ("DeclarationError", lambda: sw.Goal(low=1, high=0), "which is more than Goal.high"),
+    ("DeclarationError", lambda: sw.Part("x", clip=(1, -1)), "Part.clip is (1, -1)"),
+    # Spaces, and arguments of training
+    ("EnvError", lambda: declare(lambda: World(TEXT)).check_spaces(), "observation space Text"),
+    (
+        "EnvError",
+        lambda: declare(lambda: World(action_space=gym.spaces.Dict(x=TEXT))).check_spaces(),
+        "part x of the action space, Text",
+    ),
+    (
+        "EnvError",
+        lambda: declare(lambda: World(action_space=THOUSAND)).check_spaces(),
+        "not supported",
+    ),
+    (
+        "EnvError",
+        lambda: train(lambda: World(gym.spaces.MultiBinary(10**9))),
+        "000 are supported: 64 units",
+    ),
+    (
+        "EnvError",
+        lambda: train(lambda: World(gym.spaces.Dict(a=ABSURD))),
+        "000 are supported: 64 units",
+    ),
+    ("EnvError", lambda: train(lambda: World(action_space=ABSURD)), "000 are supported: 64 units"),
+    (
+        "TrainingError",
+        lambda: train(algorithm=sw.PPO(n_steps=10**6, num_envs=10**6)),
+        "lower num_envs or n_steps",
+    ),
+    ("DeclarationError", lambda: declare().train("runs/x", seed=-1), "seed is -1"),
+    ("DeclarationError", lambda: declare().train(5), "run_dir is 5; it must be a path"),
+    ("DeclarationError", lambda: declare().train("runs/x", track=5), "track is 5"),
+    ("DeclarationError", lambda: declare().train("runs/x", evolve=3), "it must be Evolution()"),
+    ("DeclarationError", lambda: declare(reflexes=3), "reflexes is 3; it must be a list"),
+    ("DeclarationError", lambda: declare(skills=["x" * 10_000]), "xxx', which is not a Skill"),
     # One argument alone
     (
         "DeclarationError",

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from reach import ON, SMALL, SPACES, Arm, Grip, Reach, Whole, reach
+from reach import ON, SMALL, SPACES, Arm, Grip, Reach, Whole, by_hand, reach
 from small_runs import goes_on, reports_every
 from torch.distributions import Categorical, Normal
 
@@ -123,19 +123,16 @@ def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
 
 
 def test_the_rest_of_the_action_may_be_forbidden(tmp_path):
-    with pytest.raises(SkillError, match=r"forbids the value 0 at choice 0 .* another rest"):
-        reach([Arm(), Grip()], env=masked()).train(tmp_path / "run", quiet=True)
-
-
-def test_choices_of_a_part_may_all_be_forbidden(tmp_path):
-    class First(sw.Skill):
-        acts = 0
-
-    env = masked("whole")
-    with pytest.raises(SkillError, match=r"forbids the value 0 at place 1"):
-        reach([First()], env=env).train(tmp_path / "run", quiet=True)
+    first = type("First", (sw.Skill,), {"acts": 0})()
+    whole = masked("whole")
+    for skills, env, where in (
+        ([Arm(), Grip()], masked(), "choice 0"),
+        ([first], whole, "place 1"),
+    ):
+        with pytest.raises(SkillError, match=rf"forbids the value 0 at {where}.* another rest"):
+            reach(skills, env=env).train(tmp_path / "run", quiet=True)
     # The middle of the first number is 0 from -1 on, and the second may be 4.
-    reach([First()], env=env, rest=[0, 4], steps=64).train(tmp_path / "two", quiet=True)
+    reach([first], env=whole, rest=[0, 4], steps=64).train(tmp_path / "two", quiet=True)
 
 
 def test_log_probabilities_are_those_of_the_allowed_choices():
@@ -175,7 +172,9 @@ WRONG = {
 
 @pytest.mark.parametrize(("mask", "says"), WRONG.values(), ids=WRONG)
 def test_a_wrong_mask_names_its_part(mask, says, tmp_path):
-    policy = sw.train_agent(masked(), ON, 64, tmp_path / "run", quiet=True).policy
+    policy = sw.from_function(
+        by_hand, observation_space=Reach.observation_space, action_space=SPACES["dict"]
+    )
     with pytest.raises(DeclarationError, match=says):
         sw.Player(policy).act(np.zeros(3, np.float32), mask=mask)
     spec = sw.EnvSpec(lambda: Reach(info={"action_mask": mask}), workers=1)

@@ -76,15 +76,18 @@ def middle(obs: Any) -> Any:
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", ["module", "every"])
+@pytest.mark.parametrize("name", ["module", "every", "hierarchy"])
 def test_corrections(name, tmp_path):
     torch.manual_seed(0)
     base = {
-        "every": sw.from_function(lambda obs: middle(obs)[:, :2], every=3),
-        "module": sw.from_torch(nn.Linear(3, 2), sees=("arm", "hook")),
-    }[name]
-    skill = type("Better", (sw.Skill,), {"policy": sw.Residual(base, 0.5), "acts": (0, 2)})()
-    exported(greedy([skill], rest=(0.0, 0.25, 0.0)), tmp_path / "out")
+        "every": lambda: sw.from_function(lambda obs: middle(obs)[:, :2], every=3),
+        "module": lambda: sw.from_torch(nn.Linear(3, 2), sees=("arm", "hook")),
+        "hierarchy": lambda: greedy().policy,
+    }[name]()
+    whole = name == "hierarchy"
+    how = {"policy": sw.Residual(base, 0.5), "acts": None if whole else (0, 2)}
+    skill = type("Better", (sw.Skill,), how)()
+    exported(greedy([skill], rest="zero" if whole else (0.0, 0.25, 0.0)), tmp_path / "out")
 
 
 ARM: Any = gym.spaces.Box(-1, 1, (2,), np.float32)
@@ -199,9 +202,3 @@ def test_a_plan_of_skills_with_goals_and_parts(tmp_path: Any) -> None:
         for _ in alike(Crane(), player, runner, seed=seed):
             goals.add(str(planned.policy.goal_now(runner.memory)))
     assert len(goals) > 5
-
-
-@pytest.mark.slow
-def test_a_hierarchy_that_a_skill_corrects(tmp_path):
-    skill = type("Better", (sw.Skill,), {"policy": sw.Residual(greedy().policy)})()
-    exported(greedy([skill]), tmp_path / "out")
