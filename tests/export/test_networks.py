@@ -135,21 +135,19 @@ def test_a_sampling_agent_takes_its_noise_as_an_input(name: str) -> None:
     assert len(set(actions)) > 1
 
 
-def test_an_operation_that_onnx_does_not_know_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_written_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = agent(*CASES["ppo, normalised"])
 
     def act(*args: Any) -> Any:
         return torch.from_numpy(np.zeros(int(args[1][0].sum().item()))), None, None
 
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "onnxscript", None)
+        with pytest.raises(SkillweaveError, match=r"skillweave\[onnx\]"):
+            agent_graph(policy, False, "it")
     monkeypatch.setattr(policy.algorithm, "act", act)
     with pytest.raises(SkillweaveError, match="the policy of 'land' cannot be written as ONNX"):
         agent_graph(policy, False, "the policy of 'land'")
-
-
-def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "onnxscript", None)
-    with pytest.raises(SkillweaveError, match=r"skillweave\[onnx\]"):
-        agent_graph(agent(*CASES["ppo, normalised"]), False, "it")
 
 
 def test_what_acts_in_an_export_needs_numpy_and_onnxruntime_alone(tmp_path: Path) -> None:

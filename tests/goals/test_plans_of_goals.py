@@ -194,16 +194,6 @@ def test_exploring_draws_goals_for_new_calls():
     assert 10 < len(np.unique(log.goals["go_to"][mine], axis=0)) < mine.sum()
 
 
-def test_a_skill_with_goals_that_was_never_called_is_not_chosen():
-    run = ready()
-    log = run.log_calls(300, num_envs=4)
-    rests = log.take(np.flatnonzero(log.skill == 1))
-    nothing = pytest.warns(UserWarning, match="asks for nothing")
-    with pytest.warns(UserWarning, match="no call of 'go_to'"), nothing:
-        planned = run.plan(lambda obs: obs[:, 0] > -5, rests)
-    assert planned.evaluate(3, quiet=True).mean == 1.0
-
-
 @pytest.mark.slow
 def test_a_trained_selector_starts_from_a_plan_with_goals():
     run = ready()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from small_runs import ON, Left
 
 from skillweave import Hierarchy, Skill, SkillweaveError
-from tests.small_runs import ON, Left
 
 
 def named(name) -> Skill:

@@ -204,6 +204,8 @@ def test_a_seed_reproduces_everything_another_does_not_and_no_seed_goes_on(optio
     assert after[1] != first
     assert after[2] != after[1]
     assert (play(3), play(None), play(None)) == after
+    with pytest.raises(SkillweaveError, match="one seed"):
+        env.reset(seed=[1] * N)
 
 
 def test_what_was_returned_is_not_changed_by_later_steps(options):
@@ -219,11 +221,6 @@ def test_what_was_returned_is_not_changed_by_later_steps(options):
             copies.append(x.copy())
     for x, copy in zip(kept, copies, strict=True):
         np.testing.assert_array_equal(x, copy)
-
-
-def test_a_list_of_seeds_is_an_error_for_people(options):
-    with pytest.raises(SkillweaveError, match="one seed"):
-        options(skill_set(*ALL)).reset(seed=[1] * N)
 
 
 def test_gymnasiums_own_vector_wrapper_counts_its_episodes(options):

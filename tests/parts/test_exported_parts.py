@@ -62,15 +62,6 @@ def test_learnt_skills_with_parts(sees, tmp_path):
     exported(run, tmp_path / "out")
 
 
-def test_bits_with_parts(tmp_path):
-    env = sw.EnvSpec(lambda: Crane("bits"), engine="sync", workers=1)
-    run = greedy(skills(("hook", "mode")), env=env, selector=in_turn, rest="hold")
-    export = run.export(tmp_path / "out")
-    actors = run.player(), runner_of(export), sw.Player(loaded_of(export))
-    for action, *others in episode(Crane("bits"), *actors):
-        assert all(np.array_equal(theirs, action) for theirs in others)
-
-
 def middle(obs: Any) -> Any:
     return np.concatenate([-0.5 * obs["arm"], -0.25 * obs["hook"]], axis=1)
 

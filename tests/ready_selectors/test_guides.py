@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from declaring import plainly
 from ready_selectors import chain
-from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, got_key, has_key
+from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Leave, Wait, got_key, has_key
 from small_runs import OFF, ON, SMALL, Whole, lines, reports_every
 
 from skillweave import (
@@ -57,24 +57,6 @@ class Open(Skill):
 
     def success(self, step):
         return step.next_obs[:, DOOR] == 1
-
-
-class Leave(Skill):
-    """Is ready: a step to the right."""
-
-    max_steps = 1
-
-    def policy(self, obs):
-        return np.full(len(obs), 2)
-
-
-class Wait(Skill):
-    """Is ready: nothing."""
-
-    max_steps = 2
-
-    def policy(self, obs):
-        return np.ones(len(obs), int)
 
 
 AUTOMATON = Automaton(
@@ -239,7 +221,7 @@ def test_a_population_of_restricted_selectors_evolves(tmp_path):
     skills = [
         Leave(),
         Wait(),
-        type("Back", (Wait,), {"policy": lambda s, obs: np.zeros(len(obs), int)})(),
+        type("Back", (Wait,), {"policy": chain.always(0)})(),
     ]
     for skill in skills:
         skill.max_steps = 2

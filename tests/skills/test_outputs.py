@@ -26,6 +26,8 @@ def decoded(output, n, space, who, *, mask=None, deterministic=True, rng=None):
         (np.zeros(2), Discrete(3), "float64, but actions of.*whole numbers"),
         (["a", "b"], Discrete(3), "whole numbers"),
         ([0, 3], Discrete(3), "returned 3, which is no action"),
+        ([0, 1.5], Discrete(3), "whole numbers"),
+        ([[np.nan, 1]] * 2, Box(0, 2, (2,), np.int64), "whole numbers"),
         ([0, 3], Discrete(3, start=1), "returned 0"),
         ([[0, 0], [1, 3]], MultiDiscrete([2, 3]), "returned 3"),
         ([[0, 2], [0, 0]], MultiBinary(2), "returned 2"),
