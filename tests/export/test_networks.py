@@ -150,20 +150,7 @@ def test_what_cannot_be_written_is_said(monkeypatch: pytest.MonkeyPatch) -> None
         agent_graph(policy, False, "the policy of 'land'")
 
 
-def test_what_acts_in_an_export_needs_numpy_and_onnxruntime_alone(tmp_path: Path) -> None:
-    write_export(tmp_path, agent(*CASES["ppo, normalised"]), "toy")
-    found = set()
-    for file in tmp_path.rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Import):
-                found |= {a.name.split(".")[0] for a in node.names}
-            elif isinstance(node, ast.ImportFrom) and not node.level:
-                found.add((node.module or "").split(".")[0])
-    assert found - set(sys.stdlib_module_names) == {"numpy", "onnxruntime"}
-
-
-def test_two_runners_are_loaded_by_their_paths(tmp_path: Path) -> None:
-    """Each acts by the package beside it."""
+def test_runners_act_by_the_package_beside_them_and_need_little_else(tmp_path: Path) -> None:
     config, obs, actions = CASES["ppo, normalised"]
     found = []
     for seed in range(2):
@@ -179,3 +166,11 @@ def test_two_runners_are_loaded_by_their_paths(tmp_path: Path) -> None:
             assert same(runner.act(one), player.act(one))
         found.append(sys.modules[type(runner).__mro__[1].__module__].__file__)
     assert [str(tmp_path / str(seed)) in path for seed, path in enumerate(found)] == [True, True]
+    needs = set()
+    for file in (tmp_path / "0").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                needs |= {a.name.split(".")[0] for a in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                needs.add((node.module or "").split(".")[0])
+    assert needs - set(sys.stdlib_module_names) == {"numpy", "onnxruntime"}

@@ -266,8 +266,8 @@ SELECTORS = {
 def test_evolution_with_goals(stage, learns_by):
     evolution = Evolution(population=2, generations=2, episodes=1)
     late = type("Late", (Rest,), {"initiation": lambda self, obs: obs[:, 0] > 0})()
-    how = {"selector": SELECTORS[learns_by], "steps": 900}
+    how = {"selector": SELECTORS[learns_by], "steps": 600}
     run = declared([go_to("number"), late], **how).train(
-        evolve={stage: evolution}, eval_every=300, quiet=True
+        evolve={stage: evolution}, eval_every=200, quiet=True
     )
     assert run.evaluate(2, skill="go_to").skills["go_to"].calls == 2

@@ -56,6 +56,7 @@ CASES = {
         {"steps": 801, "learn": "apart, then together"},
         {"one": 100, "two": 100, "selector": 200, "together": 401},
     ),
+    "no skill learns": ({"skills": [Ready()], "steps": 300}, {"selector": 300}),
     "a ready selector takes none": (
         {"steps": 400, "learn": "apart", "selector": lambda obs: obs[:, 0] > 0},
         {"one": 200, "two": 200},
@@ -66,10 +67,12 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_steps_are_split_as_the_hierarchy_learns(case):
     how, budgets = CASES[case]
-    found = declare(**how)
+    found = declare(*how.get("skills", ()), **{k: v for k, v in how.items() if k != "skills"})
     assert found.budgets() == budgets
     assert found.total_steps == sum(budgets.values())
     assert {s.name: s.budget for s in found.stages()} == budgets
+    whole = [s for s in found.stages() if s.name in ("selector", "together")]
+    assert all(s.kind == s.name for s in whole)
     assert found.plain_agent().steps == found.total_steps
 
 
@@ -107,6 +110,8 @@ def test_a_skills_own_steps_replace_its_part():
 
     found = declare(One(), Long(), Ready(), steps=400, learn="apart")
     assert found.budgets() == {"one": 100, "long": 1_000, "selector": 200}
+    own = declare(One(), Long(), learn="apart", apart=Apart(skill_steps=7, selector_steps=8))
+    assert own.budgets() == {"one": 7, "long": 1_000, "selector": 8}
     found.scale(0.1)
     assert found.budgets() == {"one": 10, "long": 100, "selector": 20}
     assert Long.steps == 1_000, "scaling one declaration changed the class"
@@ -129,12 +134,6 @@ def test_a_hierarchy_below_takes_a_share_for_each_who_learns_in_it():
     assert found.budgets()["inner/selector"] == 20
     found.scale(0.5)
     assert (found.steps, inner.steps) == (350, 20)
-
-
-def test_where_no_skill_learns_the_selector_trains_alone():
-    found = declare(Ready(), steps=300)
-    assert found.budgets() == {"selector": 300}
-    assert [s.kind for s in found.stages()] == ["selector"]
 
 
 def test_by_default_all_learn_together_and_skills_feel_the_task():

@@ -65,6 +65,10 @@ def test_a_hierarchy_that_loads_a_run_stays_as_it_was_declared(tmp_path):
     assert mine.skills[1].policy.call_steps == 5
     assert mine.resume(tmp_path / "run", quiet=True).declaration.call_steps == 6
     assert mine.call_steps == 9
+    mine.skills[0].steps = 200
+    with pytest.warns(match="call_steps is 6"):
+        mine.load(tmp_path / "run").declaration.scale(0.5)
+    assert mine.skills[0].steps == 200, "it shares no skills"
 
 
 @pytest.mark.parametrize(
@@ -155,14 +159,6 @@ def test_what_is_told_to_count_is_what_counts(tmp_path, monkeypatch, capsys):
     assert "deliberation_cost is 0.5 (declared now: 0.1)" in told
     assert (other.skills[0].max_steps, other.selection.deliberation_cost) == (4, 0.1)
     assert_same(tmp_path / "run", tmp_path / "whole")
-
-
-def test_a_loaded_hierarchy_shares_no_skills(tmp_path):
-    declare().train(tmp_path / "run", quiet=True)
-    mine = declare()
-    mine.skills[0].steps = 200
-    mine.load(tmp_path / "run").declaration.scale(0.5)
-    assert mine.skills[0].steps == 200
 
 
 def test_a_recipe_is_not_asked_for_what_the_command_line_changed(tmp_path, capsys):

@@ -165,19 +165,15 @@ def test_its_names_of_a_dict():
 
 
 @pytest.mark.parametrize("space", [BOX, MultiDiscrete([3, 4, 2]), MultiBinary(3), ROBOT])
-def test_the_last_action_is_held_as_it_was(space):
+def test_the_last_action_is_held_as_it_was_and_zero_is_the_nearest_to_zero(space):
     names = tuple(space) if space is ROBOT else slice(None)
     held = part(acts=names, rest="hold", space=space).part
     batch = gym.vector.utils.batch_space(space, 3)
     batch.seed(0)
     actions = pack(space, batch.sample())
     assert held.filled(3, actions).tobytes() == actions.tobytes()
-
-
-def test_zero_is_the_nearest_to_zero():
     low, high = np.array([1.0, -3.0], np.float32), np.array([2.0, -1.0], np.float32)
-    space = Box(low, high)
-    assert rest_of("zero", space)[0].tolist() == [[1.0, -1.0]]
+    assert rest_of("zero", Box(low, high))[0].tolist() == [[1.0, -1.0]]  # the nearest
     assert rest_of("zero", MultiDiscrete([3], start=[4]))[0].tolist() == [[4]]
 
 

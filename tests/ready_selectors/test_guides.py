@@ -255,7 +255,7 @@ def test_a_wrong_declaration_is_told(says):
         declare(**WRONG[says])
 
 
-def test_a_guide_that_fails_is_told_before_anything_is_trained(tmp_path):
+def test_a_guide_that_fails_is_told_and_before_anything_is_trained_if_it_always_does(tmp_path):
     def wrong(obs):
         return np.full(len(obs), 9)
 
@@ -263,6 +263,9 @@ def test_a_guide_that_fails_is_told_before_anything_is_trained(tmp_path):
     with pytest.raises(SkillError, match=r"guide: function wrong\(\) returned 9"):
         hierarchy.train(tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
+    stuck = Automaton({"search": "open", "x": "wait"}, {})
+    with pytest.raises(SkillError, match=r"'search' none of its skills \(open\) may start"):
+        declare(guide=stuck, learn="together").train(tmp_path / "run", quiet=True)
 
 
 def test_a_run_with_another_guide_is_refused(whole, tmp_path):
@@ -280,9 +283,3 @@ def test_a_run_with_another_guide_is_refused(whole, tmp_path):
     plain = declare().train(tmp_path / "plain", quiet=True)
     with pytest.raises(RunError, match="has no guide, but the selector of this hierarchy has a"):
         declare(guide=AUTOMATON).load(plain.path)
-
-
-def test_no_skill_of_a_state_may_start(tmp_path):
-    stuck = Automaton({"search": "open", "x": "wait"}, {})
-    with pytest.raises(SkillError, match=r"'search' none of its skills \(open\) may start"):
-        declare(guide=stuck, learn="together").train(tmp_path / "run", quiet=True)

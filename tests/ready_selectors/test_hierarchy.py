@@ -97,7 +97,7 @@ class Learnt(Skill):
     max_steps = 4
 
 
-def test_skills_are_trained_apart_and_the_selector_is_not(trained):
+def test_skills_are_trained_apart_and_the_selector_is_not(trained, capsys):
     manifest = json.loads((trained.path / "run.json").read_text())
     assert [s["name"] for s in manifest["stages"]] == ["learnt"]
     assert [s["status"] for s in manifest["stages"]] == ["done"]
@@ -106,6 +106,8 @@ def test_skills_are_trained_apart_and_the_selector_is_not(trained):
     assert manifest["needs_recipe"]
     assert manifest["resume_needs_recipe"]
     assert {p.name for p in (trained.path / "policies").iterdir()} == {"learnt.safetensors"}
+    assert main(["info", str(trained.path)]) == 0
+    assert "call_steps 3, ready selector: automaton\n" in capsys.readouterr().out
 
 
 def test_trained_loaded_and_exported_act_the_same(trained, tmp_path):
@@ -165,8 +167,3 @@ def test_settings_of_the_selector_on_the_command_line():
     assert not any(name.startswith("selector.") for name in list_settings(declaration))
     apply_overrides(declaration, ["selector=PPO", "selector.gamma=0.5"])
     assert declaration.selector.gamma == 0.5
-
-
-def test_the_command_line_tells_what_the_selector_is(trained, capsys):
-    assert main(["info", str(trained.path)]) == 0
-    assert "call_steps 3, ready selector: automaton\n" in capsys.readouterr().out

@@ -397,10 +397,7 @@ def test_a_mapping_is_read_back_from_json():
     assert PolicyMapping.from_json({}) == PolicyMapping()
     with pytest.raises(DeclarationError, match=r"needs the function .*ramp.*give it in code"):
         PolicyMapping.from_json(data)
-
-
-def test_functions_of_one_name_are_told_apart():
-    one, two = (lambda obs, k=k: obs["gyro"] * k for k in (1.0, 2.0))
+    one, two = (lambda obs, k=k: obs["gyro"] * k for k in (1.0, 2.0))  # of one name
     mapping = sw.from_function(zeros, sees=(one, two, one, sw.Goal()), goal=two).mapping
     assert len(mapping.functions()) == 2
     data = json.loads(json.dumps(mapping.to_json()))
