@@ -149,6 +149,12 @@ METHODS: dict[str, list[tuple[Callable[..., Any], str]]] = {
             lambda _, step: None,
             "reward() returned None at step 1, but shape (4,) was expected: does it lack a return?",
         ),
+        (lambda _, step: [[1.0], [1.0, 2.0]], "which is no array: ValueError"),
+        (
+            lambda _, step: ["a"] * len(step.obs),
+            "reward() returned <U1 ('a') at step 1, but rewards are real numbers",
+        ),
+        (lambda _, step: [None] * len(step.obs), "returned object"),
         (lambda _, step: step.next_obs[:, 9], "step.next_obs has the shape (4, 4)"),
         (lambda _, step: step.next_observations[:, 0], "is 'next_obs' meant?"),
         (overwrite, "its argument is read-only: change a copy"),
@@ -167,6 +173,14 @@ METHODS: dict[str, list[tuple[Callable[..., Any], str]]] = {
             "but yes or no (bool) is needed: return a comparison",
         ),
         (
+            lambda _, step: np.full(len(step.obs), 7),
+            "termination() returned 7 at step 1 for environment 0, but yes or no",
+        ),
+        (lambda _, step: np.full(len(step.obs), np.nan), "returned nan at step 1 for environment"),
+        (lambda _, step: ["no"] * len(step.obs), "termination() returned <U2 ('no')"),
+        (lambda _, step: [None] * len(step.obs), "termination() returned object"),
+        (lambda _, step: np.full(len(step.obs), 1j), "termination() returned complex128"),
+        (
             lambda _, step: step.next_obs[:, 0] > 1 and step.next_obs[:, 1] > 0,
             "combine arrays by & and |, with each side in parentheses",
         ),
@@ -174,6 +188,7 @@ METHODS: dict[str, list[tuple[Callable[..., Any], str]]] = {
         (lambda _, obs: obs.mean(axis=1) > 1, "its argument is a Step: write step.next_obs[:, 0]"),
     ],
     "success": [
+        (lambda _, step: np.full(len(step.obs), 7), "success() returned 7 at step 1"),
         (lambda _, step: step.next_obs[0] > 1, "success() returned shape (4,) for 3 environments"),
     ],
     "initiation": [
@@ -182,6 +197,7 @@ METHODS: dict[str, list[tuple[Callable[..., Any], str]]] = {
             lambda _, step: step.obs[:, 0] > 1,
             "its argument is observations, not a Step: write obs[:, 0]",
         ),
+        (lambda _, obs: np.full(len(obs), 7), "initiation() returned 7"),
         (lambda _, obs: np.zeros(len(obs), bool), "Let at least one start everywhere"),
     ],
 }

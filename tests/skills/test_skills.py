@@ -102,37 +102,6 @@ def step_of(last: int = 2) -> Step:
     return Step(obs, action, obs.copy(), reward, never, never, never, elapsed, {}, goal)
 
 
-@pytest.mark.parametrize(
-    ("bad", "says"),
-    [
-        ([[1.0], [1.0, 2.0]], "which is no array: ValueError"),
-        (["a", "b"], r"returned <U1 \('a'\) at step 2, but rewards are real numbers"),
-        ([None, 1], "returned object .*real numbers"),
-    ],
-)
-def test_a_reward_of_another_kind_is_told(bad, says):
-    skill = type("Odd", (Skill,), {"reward": lambda self, step: bad})()
-    with pytest.raises(SkillweaveError, match=rf"skill 'odd': reward\(\) {says}|{says}"):
-        call_method(skill, "reward", step_of(2))
-
-
-@pytest.mark.parametrize("method", ["termination", "success", "initiation"])
-@pytest.mark.parametrize(
-    ("bad", "says"),
-    [
-        ([0, 7], "returned 7 at step 3 for environment 1, but yes or no"),
-        ([np.nan, 1.0], "returned nan at step 3 for environment 0, but yes or no"),
-        (["no", ""], r"returned <U2 \('no'\)"),
-        ([None, True], "returned object"),
-        ([1j, 0], "returned complex128"),
-    ],
-)
-def test_what_is_neither_yes_nor_no_is_told(method, bad, says):
-    skill = type("Odd", (Skill,), {method: lambda self, about: bad})()
-    with pytest.raises(SkillweaveError, match=rf"skill 'odd': {method}\(\) {says}"):
-        call_method(skill, method, step_of(3))
-
-
 def test_zeros_and_ones_of_any_kind_are_yes_and_no():
     for kind in (list, np.float32, bool, np.uint8):
 
