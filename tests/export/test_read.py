@@ -282,7 +282,8 @@ def test_what_is_no_folder_of_a_policy_says_what_it_is(
     with pytest.raises(RunError, match=r"net.onnx is a file; .*from_onnx"):
         sw.load_policy(saved.parent / "net.onnx")
     assert sw.load_policy(saved / "policy.json")
-    run = sw.train_agent("CartPole-v1", sw.PPO(num_envs=2, n_steps=8), 16, saved / "run")
+    env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
+    run = sw.train_agent(env, sw.PPO(num_envs=2, n_steps=8), 16, saved / "run")
     with pytest.raises(RunError, match=r"run is a run, not an exported policy: sw.load\('.*run'"):
         sw.load_policy(run.path)
     pytest.importorskip("huggingface_hub")

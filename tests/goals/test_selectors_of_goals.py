@@ -110,29 +110,24 @@ def test_a_selector_with_values_chooses_discrete_goals(selector, space, tmp_path
     hierarchy("together").train(seed=3, quiet=True)
 
 
-def skill_of(space):
-    """A skill with goals of a space."""
-    skill = go_to()
-    type(skill).goal_space = space
-    if space.shape is None:
-        type(skill).reward = lambda self, step: step.goal["at"].sum(1)
-        type(skill).termination = type(skill).success = lambda self, step: step.goal["at"][:, 0] > 9
-    return skill
-
-
-def evaluated(selector, space):
-    """Evaluate a selector of a skill with goals of a space."""
-    hierarchy = declared([skill_of(space), Rest()], selector=selector)
-    return hierarchy.train(quiet=True).evaluate(2)
-
-
 def test_goals_of_other_rows_may_be_anything():
     def rule(obs):
         goes = obs[:, 0] > 0
         goals = np.where(goes[:, None], [200, 3], -1)
         return np.where(goes, "go_to", "rest"), goals
 
-    assert len(evaluated(rule, BYTES).returns) == 2
+    run = declared([go_to(goal_space=BYTES), Rest()], selector=rule).train(quiet=True)
+    assert len(run.evaluate(2).returns) == 2
+
+
+def never(self, step):
+    return step.goal["at"][:, 0] > 9
+
+
+def nested():
+    """A skill with goals of parts, some of whole numbers."""
+    how = {"reward": lambda self, step: step.goal["at"].sum(1), "termination": never}
+    return go_to(goal_space=NESTED, success=never, **how)
 
 
 AT = {"at": (0.5, -0.5), "byte": (1, 2)}
@@ -153,7 +148,7 @@ def rows_of(goal, n):
 )
 def test_a_function_gives_goals_of_several_parts(goals, space, wanted):
     rule = lambda obs: (["go_to"] * len(obs), goals(obs))  # noqa: E731
-    skill = go_to("tuple") if space is None else skill_of(space)
+    skill = go_to("tuple") if space is None else nested()
     run = declared([skill, Rest()], selector=rule).train(quiet=True)
     player = run.player()
     player.act(np.ones(2, np.float32))

@@ -23,10 +23,10 @@ def test_a_reward_that_ignores_the_goal_is_said(capsys):
         def reward(self, step):
             return step.next_obs[:, 0]
 
-    declared([Blind()]).train()
+    declared([Blind()], steps=64).train()
     said = capsys.readouterr()
     assert "none reads step.goal" in said.out + said.err
-    declared([go_to()]).train()
+    declared([go_to()], steps=64).train()
     said = capsys.readouterr()
     assert "none reads step.goal" not in said.out + said.err
 
