@@ -16,6 +16,7 @@ from toys import World
 from skillweave import (
     PPO,
     Apart,
+    EnvSpec,
     Hierarchy,
     Skill,
     SkillweaveError,
@@ -37,7 +38,10 @@ def skill(name, policy, **attributes):
     return type(name, (Skill,), {"name": name, "policy": policy, **attributes})()
 
 
-def declare(*skills, env="CartPole-v1", **more):
+CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
+
+
+def declare(*skills, env=CARTPOLE, **more):
     return Hierarchy(
         env, skills, selector=SMALL, call_steps=5, apart=Apart(selector_steps=200), **plainly(more)
     )
@@ -237,8 +241,9 @@ def test_other_actions_than_choices(tmp_path, space):
     choose = (lambda obs: obs[:, :2]) if isinstance(space, Box) else None
     choose = choose or (lambda obs: (obs[:, :2] > 0).astype(int))
     skills = [skill("net", linear(weight)), skill("function", choose)]
+    env = EnvSpec(lambda: World(seen, space), engine="sync", workers=1)
     for greedy in (True, False):
-        h = declare(*skills, env=lambda: World(seen, space), greedy_skills=greedy)
+        h = declare(*skills, env=env, greedy_skills=greedy)
         run = h.train(tmp_path / str(greedy), quiet=True)
         assert acts(h.load(run.path).policy, 3)[0][1] == acts(run.policy, 3)[0][1]
         assert run.evaluate(3, skill="net") == h.load(run.path).evaluate(3, skill="net")

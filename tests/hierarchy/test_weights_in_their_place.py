@@ -9,7 +9,7 @@ import pytest
 import torch
 from declaring import plainly
 
-from skillweave import PPO, Hierarchy, Network, Skill, SkillweaveError
+from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill, SkillweaveError
 from skillweave.algorithms.agent_policy import state_from
 from skillweave.cli import main
 from skillweave.compat.agilerl import agent_classes as agilerl
@@ -22,7 +22,8 @@ NAMES = "left", "right", "stay"
 def declare(names: tuple[str, ...] = NAMES) -> Hierarchy:
     skills = [type(name, (Skill,), {"name": name})() for name in names]
     how = {"skill_steps": 32, "selector_steps": 64, "call_steps": 4}
-    return Hierarchy("CartPole-v1", skills, algorithm=SMALL, selector=SMALL, **plainly(how))
+    env = EnvSpec("CartPole-v1", engine="sync", workers=1)
+    return Hierarchy(env, skills, algorithm=SMALL, selector=SMALL, **plainly(how))
 
 
 @pytest.fixture(scope="module")
