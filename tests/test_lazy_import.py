@@ -61,7 +61,8 @@ def test_the_probe_sees_what_a_real_command_imports():
 def test_importing_the_package_imports_nothing_heavy_until_a_name_is_used():
     code = "import sys, skillweave\n"
     code += f"print([n for n in {HEAVY!r} if n in sys.modules])\n"
-    code += "skillweave.PPO\nprint('torch' in sys.modules)\n"
+    code += "skillweave.PPO, skillweave.Skill, skillweave.from_onnx, skillweave.from_torch\n"
+    code += "print('torch' in sys.modules)\n"
     code += "skillweave.Hierarchy\nprint('torch' in sys.modules)\n"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split("\n")[:3] == ["[]", "False", "True"]

@@ -27,6 +27,7 @@ import skillweave as sw
 from skillweave import recipes
 from skillweave._internal.messages import ELSEWHERE, RECORDINGS, STARTS
 from skillweave.algorithms.agent_policy import make_algorithm
+from skillweave.cli.overrides import apply_overrides
 from skillweave.envs import one_of
 from skillweave.envs.make import make_engine
 from skillweave.errors import KINDS, SkillError, SkillweaveError
@@ -134,6 +135,9 @@ METHODS: dict[str, list[tuple[Callable[..., Any], str]]] = {
         (lambda _, step: step.next_obs[:, 0] * step.next_obs[0], "for 3 it raised ValueError"),
         (lambda _, step: np.full(len(step.obs), np.nan), "nan at step 1 for environment 0"),
         (lambda _, step: None, "returned None at step 1, but shape (4,) was expected: does it"),
+        (lambda _, step: [[1.0], [1.0, 2.0]], "which is no array: ValueError"),
+        (lambda _, step: ["a"] * len(step.obs), "returned <U1 ('a') at step 1, but rewards are"),
+        (lambda _, step: [None] * len(step.obs), "returned object"),
         (lambda _, step: step.next_obs[:, 9], "step.next_obs has the shape (4, 4)"),
         (lambda _, step: step.next_observations[:, 0], "is 'next_obs' meant?"),
         (overwrite, "its argument is read-only: change a copy"),
@@ -142,16 +146,23 @@ METHODS: dict[str, list[tuple[Callable[..., Any], str]]] = {
         (lambda _, step: step.next_obs[0] > 1, "shape (4,) for 3"),
         (lambda _, step: False, "shape () at step 1, but (4,) was expected: one yes or no for"),
         (lambda _, step: step.next_obs[:, 0], "is needed: return a comparison"),
+        (lambda _, step: np.full(len(step.obs), 7), "7 at step 1 for environment 0, but yes or no"),
+        (lambda _, step: np.full(len(step.obs), np.nan), "returned nan at step 1 for environment"),
+        (lambda _, step: ["no"] * len(step.obs), "returned <U2 ('no')"),
+        (lambda _, step: [None] * len(step.obs), "returned object"),
+        (lambda _, step: np.full(len(step.obs), 1j), "returned complex128"),
         (lambda _, step: step.next_obs[:, 0] > 1 and step.next_obs[:, 1] > 0, "by & and |"),
         (lambda _, obs: obs[:, 0] > 1, "is a Step: write step.next_obs[:, 0]"),
         (lambda _, obs: obs.mean(axis=1) > 1, "is a Step: write step.next_obs[:, 0]"),
     ],
     "success": [
+        (lambda _, step: np.full(len(step.obs), 7), "returned 7 at step 1"),
         (lambda _, step: step.next_obs[0] > 1, "shape (4,) for 3 environments"),
     ],
     "initiation": [
         (lambda _, obs: obs[0] > -9, "shape (4,) for 3 environments"),
         (lambda _, step: step.obs[:, 0] > 1, "not a Step: write obs[:, 0]"),
+        (lambda _, obs: np.full(len(obs), 7), "returned 7"),
         (lambda _, obs: np.zeros(len(obs), bool), "Let at least one start everywhere"),
     ],
 }
@@ -570,6 +581,8 @@ def test_looking_for_a_forgotten_axis_does_not_change_training(
 # Goals, parts, corrections, and what is wrong with one argument alone
 
 POINT = goals.Point.observation_space
+TEXT, THOUSAND = gym.spaces.Text(3), gym.spaces.Box(0, 999, (1,), np.int64)
+ABSURD = gym.spaces.MultiDiscrete([2**60, 2**62])
 BYTES = gym.spaces.Box(0, 255, (2,), np.uint8)
 NESTED = gym.spaces.Dict({"at": gym.spaces.Box(-1, 1, (2,), np.float32), "byte": BYTES})
 GO = "go_to"
@@ -595,12 +608,30 @@ def each(name: Any, *given: Any) -> Any:
     return lambda obs: (np.full(len(obs), name), *given) if given else np.full(len(obs), name)
 
 
-def options(actions: Any) -> Any:
+def options(actions: Any, space: Any = goals.SPACES["box"]) -> Any:
     """Take actions in an OptionsEnv of two environments."""
-    run = goals.declared([goals.go_to(), goals.Rest()]).train(quiet=True)
+    skills = [goals.go_to(goal_space=space, policy=goals.walk), goals.Rest()]
+    run = goals.declared(skills, selector=goals.rests).train(quiet=True)
     env = sw.envs.make_options_env(run, 2, 0.9)
     env.reset(seed=0)
     return env.step(actions)
+
+
+def draws(drawn: Any) -> None:
+    """Train a skill whose goals are drawn so."""
+    goals.declared([goals.go_to(goals=drawn)]).train(quiet=True)
+
+
+def player(goal: Any, space: str = "box", skill: Any = GO) -> sw.Player:
+    """Let a ready skill act for a goal."""
+    return goals.ready(space).player(skill=skill, goal=goal)
+
+
+def planned(task: Any, **done: Any) -> None:
+    """Plan for a task, or judge calls, on a log of calls that have goals."""
+    run = goals.ready()
+    log = run.log_calls(100)
+    log.handover(done=done) if done else run.plan(task, log)
 
 
 def sighted(sees: Any) -> None:
@@ -637,6 +668,7 @@ def automaton(transitions: Any) -> Any:
 
 
 TWO = {"at": np.zeros((1, 2)), "side": np.zeros(1, int)}
+TWICE = {"skill": np.zeros(2, int), "goal": {GO: np.array([[1, 1], [300, 1]])}}
 WIDE = {"skill": [0, 0], "goal": {GO: np.zeros((2, 3))}}
 IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     # Goals that a selector gives
@@ -675,6 +707,44 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ("SkillError", lambda: goes(at({"at": (0.5, 0.5), "byte": (300, 1)}), NESTED), "part 'byte'"),
     ("SkillError", lambda: goes(at({"at": (0.5, 0.5), "byte": (1.5, 1)}), NESTED), "whole numbers"),
     ("SkillError", lambda: goes(at({"at": (0.5, 0.5), "byte": (1, 2, 3)}), NESTED), "of shape"),
+    ("SkillError", lambda: options(TWICE, BYTES), "gave the goal [300, 1]"),
+    # Goals that a skill draws, and goals of one skill alone
+    ("SkillError", lambda: draws(lambda s, obs, rng: obs[0]), "shape (2,) for skill 'go_to'"),
+    ("SkillError", lambda: draws(lambda s, obs, rng: None), "goals() returned None"),
+    ("SkillError", lambda: draws(lambda s, obs, rng: obs.astype(str)), "goals() gave goals of <U"),
+    ("SkillError", lambda: draws(lambda s, obs, rng: obs + 7), "goals() gave the goal ["),
+    ("SkillError", lambda: draws(lambda s, obs, rng: obs.no), "goals() raised AttributeError"),
+    ("SkillError", lambda: player((5, 5)), "the player gave the goal"),
+    ("SkillError", lambda: player((0.5,)), "gave a goal of shape (1,) for skill 'go_to', but (2,)"),
+    ("SkillError", lambda: player((257, 0), "bits"), "gave the goal [257, 0], which is out of"),
+    ("SkillError", lambda: player({"at": (0, 0)}, "dict"), "a dict with 'at', 'side' was expected"),
+    ("SkillError", lambda: player({"at": (0, 5), "side": 1}, "dict"), "out of goal_space"),
+    ("SkillError", lambda: player({"at": (0,), "side": 1}, "dict"), "(1, 2) was expected"),
+    ("SkillError", lambda: player(3, "tuple"), "the player gave"),
+    ("DeclarationError", lambda: player((0, 0)).act(np.zeros((1, 2))), "without an axis"),
+    ("DeclarationError", lambda: player((0, 0), skill=None), "policy that takes none: name a"),
+    (
+        "SkillError",
+        lambda: goals.ready().evaluate(2, skill=GO, goal=(5, 5)),
+        "evaluate() gave the goal [5.0, 5.0]",
+    ),
+    (
+        "DeclarationError",
+        lambda: goals.ready().evaluate(2, skill="rest", goal=(0, 0)),
+        "skill 'rest' has no goals",
+    ),
+    ("DeclarationError", lambda: goals.ready().render("a.gif", goal=(0, 0)), "name it, skill="),
+    ("DeclarationError", lambda: goals.ready().evaluate(2).goals, 'evaluate(skill="go_to")'),
+    (
+        "DeclarationError",
+        lambda: goals.ready().evaluate(2, skill="rest").goals,
+        "no skill with goals acted alone",
+    ),
+    # A task knows no goal
+    ("SkillError", lambda: planned(GO), "step.goal: that is None here"),
+    ("SkillError", lambda: planned(lambda step: step.goal[:, 0] > 0), "None here"),
+    ("SkillError", lambda: planned(lambda step: step.next_obs > step.goal), "None here"),
+    ("SkillError", lambda: planned(None, go_to=lambda step: step.goal[:, 0] > 0), "None here"),
     # Goals in an OptionsEnv
     ("DeclarationError", lambda: options([0, 1]), "goals for 'go_to'"),
     (
@@ -706,6 +776,26 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ),
     (
         "DeclarationError",
+        lambda: fits(goals.go_to(goal_space=gym.spaces.Dict(at=POINT, word=gym.spaces.Text(4)))),
+        "the part word of the goal_space",
+    ),
+    (
+        "DeclarationError",
+        lambda: fits(goals.go_to(goal_space=gym.spaces.Text(4), policy=goals.walk)),
+        "is not supported",
+    ),
+    (
+        "DeclarationError",
+        lambda: fits(goals.go_to(goal_space=gym.spaces.Box(-1, 1, (0,)))),
+        "which holds no number: leave it out",
+    ),
+    (
+        "DeclarationError",
+        lambda: fits(goals.go_to(goal_space=gym.spaces.Dict({1: POINT}))),
+        "each with text as its name",
+    ),
+    (
+        "DeclarationError",
         lambda: fits(
             selector=goals.SELECTOR,
             guide=sw.Guide(sw.Automaton({"a": {(GO, (0.5, 0.5)), "rest"}}, {})),
@@ -717,6 +807,12 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ("DeclarationError", lambda: sighted(("observatoin", "goal")), "is 'observation' meant"),
     ("PolicyError", lambda: fits(goals.go_to(policy=lambda self, obs: obs)), "takes no goal"),
     ("DeclarationError", lambda: fits(goals.go_to(policy=lambda s, o: o)), "takes (s, o), which"),
+    ("PolicyError", lambda: fits(goals.go_to(policy=torch.nn.Linear(2, 2))), "write Goal() at its"),
+    (
+        "PolicyError",
+        lambda: fits(goals.go_to(policy=sw.train_agent(goals.Point, goals.ON, 100).policy)),
+        "has goals, but its policy observes Box",
+    ),
     # Parts and corrections
     ("DeclarationError", lambda: crane.crane([skill(policy=crane.crane(), acts=0)]), "no acts of"),
     ("DeclarationError", lambda: cranes(skill(), rest="hold"), "no skill writes a part"),
@@ -732,6 +828,16 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ("DeclarationError", lambda: sw.Residual(goals.Rest()), "is the skill 'rest'"),
     ("DeclarationError", lambda: sw.Residual(crane.Arm), "is the class Arm"),
     ("DeclarationError", lambda: sw.Residual(arm()), "a skill that learns, and no policy"),
+    (
+        "DeclarationError",
+        lambda: sw.Residual(crane.greedy([arm()]).as_skill("ready")),
+        "the skill 'ready', and no policy",
+    ),
+    (
+        "DeclarationError",
+        lambda: cranes(skill(policy=sw.Residual(crane.greedy([arm()])))),
+        "has a policy, but is none",
+    ),
     ("DeclarationError", lambda: cranes(skill(policy=arm())), "is the skill 'arm'"),
     (
         "DeclarationError",
@@ -761,6 +867,30 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
     ("DeclarationError", lambda: automaton([ended]), "transitions are"),
     ("DeclarationError", lambda: automaton({("a", "b"): "won"}), "has the event 'won'"),
     ("DeclarationError", lambda: bound(sw.Automaton({"a": "fly"}, {})), "state 'a' names 'fly'"),
+    ("DeclarationError", lambda: declare(selector=sw.Automaton), "an Automaton or a tree"),
+    (
+        "DeclarationError",
+        lambda: declare(selector=each("good"), selection=sw.Selection(target_return=1.0)),
+        "selector is ready",
+    ),
+    ("SkillError", lambda: declare(selector=each(7)).check_spaces(), "<lambda>() returned 7"),
+    (
+        "SkillError",
+        lambda: declare(
+            selector=sw.tree.Sequence(sw.tree.Condition(np.sign, "x"), "good")
+        ).check_spaces(),
+        "selector: tree: x() returned shape",
+    ),
+    (
+        "DeclarationError",
+        lambda: declare(selector=each("s"), skills=[skill(policy=zeros)], steps=None).plain_agent(),
+        "no part of this hierarchy is trained",
+    ),
+    (
+        "DeclarationError",
+        lambda: apply_overrides(declare(selector=each("good")), ["selector.gamma=0.5"]),
+        "selector.gamma: the selector is ready",
+    ),
     ("DeclarationError", lambda: sw.tree.Sequence(), "Sequence has no children"),
     ("DeclarationError", lambda: sw.tree.Fallback("a", 3), "has the child 3"),
     ("DeclarationError", lambda: sw.tree.Sequence(sw.tree.Fallback), "has the child <class"),
@@ -828,6 +958,49 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
         lambda: make_algorithm(sw.SAC(target_entropy=1.5), POINT, POINT),
         "SAC.target_entropy is 1.5",
     ),
+    # Skills and reflexes
+    ("DeclarationError", lambda: skill(name=5).validate(), "name is 5; it must be a text"),
+    ("DeclarationError", lambda: skill(reward=3).validate(), "reward is 3; it must be a method"),
+    ("DeclarationError", lambda: sw.Reflex(3, 0), "Reflex's condition is 3"),
+    ("DeclarationError", lambda: sw.Reflex(max, 0, 5), "Reflex's name is 5"),
+    ("DeclarationError", lambda: with_skill(policy="skill.onnx"), "from_onnx"),
+    ("DeclarationError", lambda: with_skill(policy=3), "is 3, which cannot act"),
+    ("DeclarationError", lambda: sw.Goal(low=1, high=0), "which is more than Goal.high"),
+    ("DeclarationError", lambda: sw.Part("x", clip=(1, -1)), "Part.clip is (1, -1)"),
+    # Spaces, and arguments of training
+    ("EnvError", lambda: declare(lambda: World(TEXT)).check_spaces(), "observation space Text"),
+    (
+        "EnvError",
+        lambda: declare(lambda: World(action_space=gym.spaces.Dict(x=TEXT))).check_spaces(),
+        "part x of the action space, Text",
+    ),
+    (
+        "EnvError",
+        lambda: declare(lambda: World(action_space=THOUSAND)).check_spaces(),
+        "not supported",
+    ),
+    (
+        "EnvError",
+        lambda: train(lambda: World(gym.spaces.MultiBinary(10**9))),
+        "000 are supported: 64 units",
+    ),
+    (
+        "EnvError",
+        lambda: train(lambda: World(gym.spaces.Dict(a=ABSURD))),
+        "000 are supported: 64 units",
+    ),
+    ("EnvError", lambda: train(lambda: World(action_space=ABSURD)), "000 are supported: 64 units"),
+    (
+        "TrainingError",
+        lambda: train(algorithm=sw.PPO(n_steps=10**6, num_envs=10**6)),
+        "lower num_envs or n_steps",
+    ),
+    ("DeclarationError", lambda: declare().train("runs/x", seed=-1), "seed is -1"),
+    ("DeclarationError", lambda: declare().train(5), "run_dir is 5; it must be a path"),
+    ("DeclarationError", lambda: declare().train("runs/x", track=5), "track is 5"),
+    ("DeclarationError", lambda: declare().train("runs/x", evolve=3), "it must be Evolution()"),
+    ("DeclarationError", lambda: declare(reflexes=3), "reflexes is 3; it must be a list"),
+    ("DeclarationError", lambda: declare(skills=["x" * 10_000]), "xxx', which is not a Skill"),
     # One argument alone
     (
         "DeclarationError",

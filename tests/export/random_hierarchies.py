@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from playing import alike
 from random_networks import agent
-from reference_calls import POSITION, TAG, Left, T, Walk, Zigzag, scripted, shy
+from reference_calls import POSITION, TAG, Left, Right, T, Walk, Zigzag, scripted, shy
 from toys import skills_of
 
-from skillweave import PPO, Automaton, Network
+from skillweave import PPO, Automaton, Lengths, Network
 from skillweave.algorithms import RNN
 from skillweave.algorithms.config import SkillCritic
 from skillweave.api.player import Player
@@ -23,9 +23,10 @@ from skillweave.export import compile
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
+from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.skills import Skill, ready_selector
 from skillweave.skills.skill_set import SkillSet
-from skillweave.types import Array, Step
+from skillweave.types import Array, LastCall, Step
 
 
 @cache
@@ -131,7 +132,22 @@ AUTOMATON = Automaton(
 )  # fmt: skip
 
 
-POLICIES: dict[str, Any] = {
+GUIDED = ActiveGuide(
+    ready_selector(AUTOMATON, ("careful", "left", "zigzag", "right")),  # type: ignore[arg-type]
+)
+
+
+def choose(obs: Array, last: LastCall) -> Array:
+    return np.where(last.succeeded, 1, (obs[:, T].astype(int) + last.skill) % 2)
+
+
+HIERARCHIES: dict[str, Any] = {
+    "automaton": lambda: ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right)),
+    "function": lambda: ready(choose, skill_set(Careful, Zigzag, reflexes=(shy(),))),
+    "guide": lambda: HierarchyPolicy(
+        network(4, seed=7), skill_set(Careful, Left, Zigzag, Right), GUIDED
+    ),
+    "lengths": lambda: trained(skill_set(Left, Free, call_steps=Lengths(1, 3))),
     "nested": nested,
     "memories": lambda: trained(skill_set(Remembers, Left, Free), 2),
     "interrupted": lambda: interrupted(0.02, deciding=True),

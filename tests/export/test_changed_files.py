@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from random_hierarchies import traced_once
-from test_read import HIERARCHIES
+from random_hierarchies import HIERARCHIES, traced_once
 
 import skillweave as sw
 from skillweave.errors import SkillweaveError

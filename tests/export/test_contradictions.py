@@ -38,7 +38,6 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-FREE = {"file": "free.onnx"}
 STATE = {"type": "StateMachine", "who": "it", "skills": ["free", "remembers"], "goals": {}}
 REVERSED = ["remembers", "free"]
 ONE = {"states": {"a": ["free"]}, "transitions": [], "first": "a"}

@@ -25,7 +25,6 @@ from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.skills import ready_selector
 from skillweave.skills.goal_spaces import choice_space, with_goal
 from skillweave.skills.goals import goals_of
-from skillweave.skills.lengths import Lengths
 from skillweave.skills.skill_set import SkillSet
 
 pytest.importorskip("onnxscript")
@@ -89,15 +88,6 @@ class Elsewhere(GoTo):
     policy = sw.from_torch(torch.nn.Linear(4, 2), sees=(0, sw.Goal(low=-0.5), 1))
 
 
-def far(obs: Any) -> Any:
-    return np.full(len(obs), "go_to"), np.full((len(obs), 2), 0.9) * np.sign(place_of(obs) + 0.01)
-
-
-def parts(obs: Any) -> Any:
-    at = np.tanh(3 * place_of(obs)).astype(np.float32)
-    return np.full(len(obs), "go_to"), {"at": at, "side": (at[:, 0] > 0).astype(int)}
-
-
 def made(*skills: Any, selector: Any = PPO, env: Any = None, **how: Any) -> Any:
     env = env or Point()
     skills = tuple(s if isinstance(s, sw.Skill) else s() for s in skills)
@@ -105,30 +95,6 @@ def made(*skills: Any, selector: Any = PPO, env: Any = None, **how: Any) -> Any:
         if isinstance(skill, GoTo) and type(skill).__name__ != "GoTo":
             skill.name = "go_to"
     return env, selected(env, skills_of(env, *skills, **how), selector)
-
-
-def within(cut: bool = False) -> Any:
-    """A hierarchy with goals of its own, perhaps with a critic that interrupts calls."""
-    env = Point()
-    skills = skills_of(env, go_to(), go_to(name="other"), Rest(), call_steps=2)
-    whole = type("Far", (GoTo,), {"max_steps": 7})()
-    own = goals_of(whole)
-    assert own is not None
-    seen = with_goal(env.observation_space, own.goal_space)
-    spaces = {"go_to": GoTo.goal_space, "other": GoTo.goal_space}
-    if cut:
-        config = SkillCritic(network=SMALL, normalize_obs=False, deciding=True, sees_goals=True)
-        with_goals = with_goal(seen, gym.spaces.Dict(list(spaces.items())))
-        critic = mild(config, with_goals, gym.spaces.Discrete(3), seed=1)
-        skills = with_interruption(skills, critic, 0.02)
-    inner = selected(env, skills, PPO, seen)
-    inner = HierarchyPolicy(inner.selector, skills, None, own)
-    outer = SkillSet((whole, Rest()), (inner, skills.policies[2]), call_steps=5)
-    return env, selected(env, outer, chooses_far)
-
-
-def chooses_far(obs: Any) -> Any:
-    return np.where(obs[:, 0] > -0.9, "far", "rest"), np.tanh(obs)
 
 
 def interrupted() -> Any:
@@ -143,7 +109,6 @@ def interrupted() -> Any:
 
 CASES: dict[str, Any] = {
     "ppo": lambda: made(go_to(), Rest),
-    "lengths": lambda: made(go_to(), Rest, call_steps=Lengths(2, 5)),
     "recurrent": lambda: made(go_to(), Rest, selector=RECURRENT, config=RECURRENT),
     "squashed": lambda: made(
         go_to("box of float64"), Rest, selector=sw.PPO(network=SMALL, squash_actions=True)
@@ -152,11 +117,7 @@ CASES: dict[str, Any] = {
     "number": lambda: made(go_to("number"), Rest, selector=RECURRENT),
     "dqn": lambda: made(go_to("number"), Rest, selector=sw.DQN(network=SMALL)),
     "elsewhere": lambda: made(Elsewhere, Rest),
-    "dict": lambda: made(go_to("dict"), Rest, selector=parts),
     "interrupted": interrupted,
-    "within": within,
-    "within, interrupted": lambda: within(cut=True),
-    "discrete": lambda: made(go_to(), env=Point(discrete=True)),
 }  # fmt: skip
 
 

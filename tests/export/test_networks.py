@@ -135,37 +135,22 @@ def test_a_sampling_agent_takes_its_noise_as_an_input(name: str) -> None:
     assert len(set(actions)) > 1
 
 
-def test_an_operation_that_onnx_does_not_know_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_written_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = agent(*CASES["ppo, normalised"])
 
     def act(*args: Any) -> Any:
         return torch.from_numpy(np.zeros(int(args[1][0].sum().item()))), None, None
 
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "onnxscript", None)
+        with pytest.raises(SkillweaveError, match=r"skillweave\[onnx\]"):
+            agent_graph(policy, False, "it")
     monkeypatch.setattr(policy.algorithm, "act", act)
     with pytest.raises(SkillweaveError, match="the policy of 'land' cannot be written as ONNX"):
         agent_graph(policy, False, "the policy of 'land'")
 
 
-def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "onnxscript", None)
-    with pytest.raises(SkillweaveError, match=r"skillweave\[onnx\]"):
-        agent_graph(agent(*CASES["ppo, normalised"]), False, "it")
-
-
-def test_what_acts_in_an_export_needs_numpy_and_onnxruntime_alone(tmp_path: Path) -> None:
-    write_export(tmp_path, agent(*CASES["ppo, normalised"]), "toy")
-    found = set()
-    for file in tmp_path.rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Import):
-                found |= {a.name.split(".")[0] for a in node.names}
-            elif isinstance(node, ast.ImportFrom) and not node.level:
-                found.add((node.module or "").split(".")[0])
-    assert found - set(sys.stdlib_module_names) == {"numpy", "onnxruntime"}
-
-
-def test_two_runners_are_loaded_by_their_paths(tmp_path: Path) -> None:
-    """Each acts by the package beside it."""
+def test_runners_act_by_the_package_beside_them_and_need_little_else(tmp_path: Path) -> None:
     config, obs, actions = CASES["ppo, normalised"]
     found = []
     for seed in range(2):
@@ -181,3 +166,11 @@ def test_two_runners_are_loaded_by_their_paths(tmp_path: Path) -> None:
             assert same(runner.act(one), player.act(one))
         found.append(sys.modules[type(runner).__mro__[1].__module__].__file__)
     assert [str(tmp_path / str(seed)) in path for seed, path in enumerate(found)] == [True, True]
+    needs = set()
+    for file in (tmp_path / "0").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                needs |= {a.name.split(".")[0] for a in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                needs.add((node.module or "").split(".")[0])
+    assert needs - set(sys.stdlib_module_names) == {"numpy", "onnxruntime"}

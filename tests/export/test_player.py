@@ -55,15 +55,6 @@ def test_parts_of_an_observation_may_come_in_any_order() -> None:
         assert player.act(obs) == player.act(turned)
 
 
-def test_an_observation_of_another_shape_is_refused() -> None:
-    policy = agent(PPO(network=Network((8,))), gym.spaces.Box(-1, 1, (3,)), gym.spaces.Discrete(2))
-    with pytest.raises(DeclarationError, match=r"shape \(2,\), not \(3,\)"):
-        Player(policy).act(np.zeros(2))
-    policy = agent(PPO(network=Network((8,))), NESTED, gym.spaces.Discrete(2))
-    with pytest.raises(DeclarationError, match="image"):
-        Player(policy).act({"inner": (1, np.zeros(2))})
-
-
 @pytest.mark.slow
 def test_the_command_exports_and_its_runner_runs_without_the_library(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

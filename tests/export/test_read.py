@@ -14,33 +14,22 @@ import torch
 from hub_server import go_to, serve
 from playing import loaded_of, runner_of
 from random_hierarchies import (
-    AUTOMATON,
-    POLICIES,
-    Careful,
-    Free,
-    network,
+    HIERARCHIES,
     played,
-    ready,
-    skill_set,
     traced_once,
-    trained,
 )
 from random_networks import NESTED, agent, compare
-from reference_calls import Left, Right, T, Zigzag, shy
 from skills.foreign_models import onnx_file
 from skills.mapped_models import ACTION, CASES, SPACE, observations, one, onnx_model, weights
 
 import skillweave as sw
-from skillweave import DQN, PPO, Network
+from skillweave import PPO, Network
 from skillweave.algorithms import RNN
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillweaveError
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
-from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.policies.hierarchy import ActiveGuide
-from skillweave.skills import ready_selector
 from skillweave.skills.foreign_policy import made_up
-from skillweave.types import Array, LastCall, Policy
+from skillweave.types import Policy
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("stable_baselines3")
@@ -106,19 +95,6 @@ def test_an_export_of_a_trained_agent_is_loaded(name: str, tmp_path: Path) -> No
     acts_alike(policy, loaded, [made_up(space, 6)[i : i + 3] for i in (0, 1, 2, 3)])
 
 
-def test_masks_reach_a_loaded_network(tmp_path: Path) -> None:
-    space = gym.spaces.Box(-1, 1, (3,), np.float32)
-    policy = agent(DQN(network=Network((8,))), space, gym.spaces.Discrete(4))
-    write_export(tmp_path, policy, "toy")
-    loaded, rng = sw.load_policy(tmp_path), np.random.default_rng(0)
-    for _ in range(5):
-        obs, mask = rng.normal(size=(4, 3)).astype(np.float32), rng.random((4, 4)) < 0.5
-        mask[:, 0] = True
-        np.testing.assert_array_equal(
-            loaded.act({}, obs, mask)[0], policy.act(policy.start(4), obs, mask)[0]
-        )
-
-
 def test_a_policy_without_spaces_gets_those_of_an_environment(tmp_path: Path) -> None:
     policy = sw.from_onnx(onnx_file(tmp_path / "lean.onnx"))
     with pytest.raises(PolicyError, match=r"lean.onnx has no spaces yet: give the environment"):
@@ -154,25 +130,6 @@ def test_a_goal_may_be_replaced(tmp_path: Path) -> None:
 
 
 # Hierarchies
-
-GUIDED = ActiveGuide(
-    ready_selector(AUTOMATON, ("careful", "left", "zigzag", "right")),  # type: ignore[arg-type]
-)
-
-
-def choose(obs: Array, last: LastCall) -> Array:
-    return np.where(last.succeeded, 1, (obs[:, T].astype(int) + last.skill) % 2)
-
-
-HIERARCHIES: dict[str, Any] = {
-    "automaton": lambda: ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right)),
-    "function": lambda: ready(choose, skill_set(Careful, Zigzag, reflexes=(shy(),))),
-    "guide": lambda: HierarchyPolicy(
-        network(4, seed=7), skill_set(Careful, Left, Zigzag, Right), GUIDED
-    ),
-    "lengths": lambda: trained(skill_set(Left, Free, call_steps=sw.Lengths(1, 3))),
-    **POLICIES,
-}
 
 
 @pytest.mark.fast_cases(2)
@@ -325,21 +282,14 @@ def test_what_is_no_folder_of_a_policy_says_what_it_is(
     with pytest.raises(RunError, match=r"net.onnx is a file; .*from_onnx"):
         sw.load_policy(saved.parent / "net.onnx")
     assert sw.load_policy(saved / "policy.json")
-    run = sw.train_agent("CartPole-v1", sw.PPO(num_envs=2, n_steps=8), 16, saved / "run")
+    env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
+    run = sw.train_agent(env, sw.PPO(num_envs=2, n_steps=8), 16, saved / "run")
     with pytest.raises(RunError, match=r"run is a run, not an exported policy: sw.load\('.*run'"):
         sw.load_policy(run.path)
     pytest.importorskip("huggingface_hub")
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
     with pytest.raises(RunError, match=r"no folder policies/reach, and it cannot be loaded from "):
         sw.load_policy("policies/reach")
-
-
-def test_other_spaces_than_the_environments_are_both_named(saved: Path) -> None:
-    class Walk(sw.Skill):
-        policy = sw.load_policy(saved)
-
-    with pytest.raises(SkillweaveError, match=r"skill 'walk'.*Dict.*CartPole-v1 has Box"):
-        sw.Hierarchy("CartPole-v1", [Walk()], selector=sw.PPO()).train(saved / "run", quiet=True)
 
 
 def test_a_policy_of_the_hub_is_loaded_without_what_is_not_data(

@@ -18,6 +18,7 @@ from random_hierarchies import (
     played,
     ready,
     skill_set,
+    traced_once,
     trained,
 )
 from reference_calls import Counter, Left, Right, T, Zigzag, shy
@@ -31,6 +32,7 @@ from skillweave.skills import Skill, from_onnx, from_torch
 
 pytest.importorskip("onnxscript")
 torch.set_num_threads(1)
+_ = traced_once  # of all tests here, too
 
 
 def test_code_that_is_missing_is_named_with_what_it_is(tmp_path: Path) -> None:
@@ -43,9 +45,6 @@ def test_code_that_is_missing_is_named_with_what_it_is(tmp_path: Path) -> None:
         Runner(tmp_path)
     assert set(export.functions) == set(export.code)
     assert runner_of(export).act(np.zeros(4, np.float32)) in range(3)
-
-
-def test_two_functions_of_one_name_are_told_apart(tmp_path: Path) -> None:
     twice = tuple(Reflex(lambda o, i=i: o[:, T] == i, action=i) for i in range(2))
     export = write_export(tmp_path, trained(skill_set(Free, Free, reflexes=twice)), "walk")
     assert set(export.code) == {"<lambda>.condition", "<lambda>.condition#2"}

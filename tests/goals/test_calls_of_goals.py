@@ -56,6 +56,8 @@ def test_a_selector_gives_the_goals(tmp_path):
     both = join([log, read])
     assert len(both.goals["go_to"]) == 2 * len(log)
     assert len(log.of("go_to").goals["go_to"]) == (log.skill == 0).sum()
+    with pytest.raises(RunError):
+        join([log, ready("bits").log_calls(100, num_envs=2)])
 
 
 def test_training_logs_goals():
@@ -66,14 +68,6 @@ def test_training_logs_goals():
     mine = log.skill == 0
     near = np.abs(log.end[mine] - log.goals["go_to"][mine] % 2).max(1) < 0.15
     np.testing.assert_array_equal(log.succeeded[mine], near)
-
-
-def test_a_report_shows_calls_of_skills_with_goals(tmp_path):
-    selector = sw.PPO(num_envs=2, n_steps=16, batch_size=8, update_epochs=1)
-    run = declared([go_to(policy=walk), Rest()], selector=selector).train(quiet=True)
-    found = run.report(tmp_path / "report.html", episodes=2)
-    assert not any("success()" in sentence for sentence in found["missing"])
-    assert "go_to" in (tmp_path / "report.html").read_text()
 
 
 @pytest.mark.parametrize("space", ["box", "dict"])
@@ -92,10 +86,3 @@ def test_a_skill_with_goals_rehearses_observations_and_goals(space):
     assert len(first)
     for call in first:
         assert (*log.start[call], *log.goals["go_to"][call]) in pairs
-
-
-def test_logs_with_other_goals_are_not_joined():
-    log = ready().log_calls(100, num_envs=2)
-    other = ready("bits").log_calls(100, num_envs=2)
-    with pytest.raises(RunError):
-        join([log, other])

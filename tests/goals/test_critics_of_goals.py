@@ -64,7 +64,7 @@ def test_interruption_with_goals_is_trained_and_resumed(learn, space, tmp_path):
     how = TOGETHER | {"learn": learn, "together": sw.Together(interrupt=True, margin=0.01)}
 
     def hierarchy():
-        return declared([Rest(), go_to(space)], steps=900, **how)
+        return declared([Rest(), go_to(space)], steps=600, **how)
 
     run = goes_on(hierarchy, tmp_path)
     critic = run.policy.skills.interruption.critic
@@ -76,7 +76,7 @@ def test_interruption_with_goals_is_trained_and_resumed(learn, space, tmp_path):
 
 def test_a_skill_with_goals_follows_the_task_too():
     def trained(weight):
-        hierarchy = declared([go_to(task_weight=weight), Rest()], steps=500, **TOGETHER)
+        hierarchy = declared([go_to(task_weight=weight), Rest()], steps=300, **TOGETHER)
         run = hierarchy.train(seed=1, quiet=True)
         return run.policy.skills.policies[0].weights
 
@@ -85,25 +85,25 @@ def test_a_skill_with_goals_follows_the_task_too():
     assert any(not torch.equal(own[k], again[k]) for k in own)  # Together.task_weight
 
 
-def test_a_network_that_sees_a_part_has_a_critic_that_sees_goals_too():
-    selector = sw.PPO(num_envs=4, n_steps=64, network=sw.Network(hidden=(8,), sees=(1,)))
-    how = TOGETHER | {"selector": selector, "together": sw.Together(interrupt=True)}
-    run = declared([Rest(), go_to()], steps=300, **how).train(quiet=True)
-    assert run.policy.skills.interruption.critic.algorithm.config.network.sees == (1, 2, 3)
-
-
-def test_keys_lead_to_the_same_parts_beside_goals():
-    selector = sw.PPO(num_envs=4, n_steps=64, network=sw.Network(hidden=(8,), sees="place"))
-    skill = sw.PPO(
-        num_envs=4, n_steps=64, network=sw.Network((8,), sees=("observation.place", "goal"))
+@pytest.mark.parametrize(
+    ("as_dict", "own", "below", "seen"),
+    [
+        (False, (1,), None, (1, 2, 3)),
+        (True, "place", ("observation.place", "goal"), ("observation.place", 2, 3)),
+    ],
+)
+def test_the_critic_of_a_network_that_sees_a_part_sees_goals_too(as_dict, own, below, seen):
+    selector, skill = (
+        sw.PPO(num_envs=4, n_steps=64, network=sw.Network(hidden=(8,), sees=sees))
+        for sees in (own, below)
     )
     how = TOGETHER | {"selector": selector, "together": sw.Together(interrupt=True)}
 
     def made():
-        env = sw.EnvSpec(lambda: Point(as_dict=True), workers=1)
+        env = sw.EnvSpec(lambda: Point(as_dict=as_dict), workers=1)
         return declared([Rest(), go_to(algorithm=skill)], env=env, steps=300, **how)
 
     run = made().train(quiet=True)
     critic = run.policy.skills.interruption.critic.algorithm.config.network
-    assert critic.sees == ("observation.place", 2, 3)
+    assert critic.sees == seen
     assert made().load(run.path).evaluate(3).returns == run.evaluate(3).returns

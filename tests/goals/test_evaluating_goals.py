@@ -7,7 +7,6 @@ import pytest
 from worlds import SPACES, Rest, declared
 
 from skillweave.cli import main
-from skillweave.errors import DeclarationError, SkillError
 
 EAST = (0.9, 0.0)
 
@@ -51,21 +50,6 @@ def test_each_episode_has_its_goal_and_its_result(run):
     again = run.evaluate(30, skill="go_to", quiet=True, num_envs=7)
     assert np.array_equal(score.goals, again.goals)
     assert np.array_equal(score.reached, again.reached)
-
-
-def test_a_goal_that_cannot_be(run, tmp_path):
-    with pytest.raises(SkillError, match=r"evaluate\(\) gave the goal \[5.0, 5.0\]"):
-        run.evaluate(2, skill="go_to", goal=(5, 5))
-    with pytest.raises(DeclarationError, match="skill 'rest' has no goals"):
-        run.evaluate(2, skill="rest", goal=EAST)
-    with pytest.raises(DeclarationError, match=r"render\(\): goal is .* name it, skill="):
-        run.render(tmp_path / "a.gif", goal=EAST)
-    whole = run.evaluate(2, quiet=True)
-    with pytest.raises(DeclarationError, match=r'evaluate\(skill="go_to"\) scores a skill alone'):
-        _ = whole.goals
-    alone = run.evaluate(2, skill="rest", quiet=True)
-    with pytest.raises(DeclarationError, match="no skill with goals acted alone"):
-        _ = alone.goals
 
 
 def test_the_command_takes_a_goal_as_json(run, tmp_path, capsys):

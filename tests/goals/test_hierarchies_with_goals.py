@@ -43,7 +43,7 @@ def test_it_learns_and_goes_on_bit_for_bit(learn, space, tmp_path):
     def hierarchy():
         how = {"selector": SELECTOR, "learn": learn, "train_defaults": OFTEN, "call_steps": 3}
         inner = declared([go_to(), Rest()], name="inner", **how)
-        outer = how | {"call_steps": 9, "steps": 2000}
+        outer = how | {"call_steps": 9, "steps": 1200}
         if space == "dict":  # by a rule
             outer["selector"] = lambda obs: (
                 np.where(obs[:, 0] > 0, "rest", "far"),

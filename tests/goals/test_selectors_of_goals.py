@@ -4,10 +4,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from small_runs import goes_on
-from worlds import OFF, OFTEN, ON, SELECTOR, SMALL, SPACES, Point, Rest, declared, go_to
+from worlds import OFF, OFTEN, SELECTOR, SMALL, SPACES, Rest, declared, go_to
 
 import skillweave as sw
-from skillweave.errors import PolicyError, SkillError
 
 HERE = (0.5, -0.5)
 BYTES = gym.spaces.Box(0, 255, (2,), np.uint8)
@@ -23,8 +22,6 @@ def right(obs):
 
 
 READY = {
-    "function": lambda obs: (np.full(len(obs), "go_to"), toward_zero(obs)),
-    "function, by skill": lambda obs: (np.zeros(len(obs), int), {"go_to": toward_zero(obs)}),
     "automaton": sw.Automaton(
         {"a": ("go_to", HERE), "b": ["rest", ("go_to", toward_zero)]},
         {("a", "b"): "success", ("b", "a"): "success"},
@@ -67,9 +64,9 @@ def test_a_selector_learns_skill_and_goal(space, learn):
 @pytest.mark.parametrize("space", ["box", "number", "numbers"])
 def test_an_interrupted_run_ends_with_the_same_weights(learn, space, tmp_path):
     def hierarchy():
-        return declared(
-            [Rest(), go_to(space)], selector=SELECTOR, learn=learn, steps=1500, train_defaults=OFTEN
-        )
+        how = {"learn": learn, "steps": 900, "train_defaults": OFTEN}
+        how |= {"call_steps": sw.Lengths(2, 4)} if space == "box" else {}
+        return declared([Rest(), go_to(space)], selector=SELECTOR, **how)
 
     goes_on(hierarchy, tmp_path)
 
@@ -86,12 +83,6 @@ def test_skills_with_goals_inside(learn, tmp_path):
     run = goes_on(hierarchy, tmp_path, 5)
     assert "inner/go_to" in run.evaluate(3).skills
     assert run.evaluate(2, skill="inner/go_to").skills["inner/go_to"].calls == 2
-
-
-def test_chosen_lengths_and_goals():
-    how = {"selector": SELECTOR, "call_steps": sw.Lengths(2, 4), "steps": 700}
-    run = declared([Rest(), go_to()], **how).train(quiet=True)
-    run.evaluate(3, deterministic=False)
 
 
 @pytest.mark.fast_cases(3)
@@ -112,46 +103,11 @@ def test_a_selector_with_values_chooses_discrete_goals(selector, space, tmp_path
 
     def hierarchy(learn="apart"):
         skills = [Sometimes(), go_to(space)]
-        return declared(skills, selector=selector, learn=learn, steps=600, train_defaults=OFTEN)
+        return declared(skills, selector=selector, learn=learn, steps=400, train_defaults=OFTEN)
 
     whole = goes_on(hierarchy, tmp_path, 4)
     assert sw.load(whole.path, hierarchy()).evaluate(3).returns == whole.evaluate(3).returns
     hierarchy("together").train(seed=3, quiet=True)
-
-
-def test_goals_for_skills_without_goals():
-    rule = lambda obs: (np.full(len(obs), "rest"), obs)  # noqa: E731
-    with pytest.raises(SkillError, match="returned skills and goals, but no skill"):
-        declared([Rest()], selector=rule).check_spaces()
-    agent = sw.train_agent(Point, ON, 200, quiet=True)
-    with pytest.raises(PolicyError, match="has goals, but its policy observes Box"):
-        declared([go_to(policy=agent.policy)]).check_spaces()
-
-
-def test_an_environment_of_options_does_not_change_goals():
-    skill = go_to()
-    type(skill).goal_space = BYTES
-    run = declared([skill, Rest()], selector=sw.tree.Sequence(("go_to", (1, 2)))).train(quiet=True)
-    env = sw.envs.make_options_env(run, 2, 0.9)
-    env.reset(seed=0)
-    with pytest.raises(SkillError, match=r"gave the goal \[300, 1\], which is out of goal_space"):
-        env.step({"skill": np.zeros(2, int), "goal": {"go_to": np.array([[1, 1], [300, 1]])}})
-
-
-def skill_of(space):
-    """A skill with goals of a space."""
-    skill = go_to()
-    type(skill).goal_space = space
-    if space.shape is None:
-        type(skill).reward = lambda self, step: step.goal["at"].sum(1)
-        type(skill).termination = type(skill).success = lambda self, step: step.goal["at"][:, 0] > 9
-    return skill
-
-
-def evaluated(selector, space):
-    """Evaluate a selector of a skill with goals of a space."""
-    hierarchy = declared([skill_of(space), Rest()], selector=selector)
-    return hierarchy.train(quiet=True).evaluate(2)
 
 
 def test_goals_of_other_rows_may_be_anything():
@@ -160,7 +116,18 @@ def test_goals_of_other_rows_may_be_anything():
         goals = np.where(goes[:, None], [200, 3], -1)
         return np.where(goes, "go_to", "rest"), goals
 
-    assert len(evaluated(rule, BYTES).returns) == 2
+    run = declared([go_to(goal_space=BYTES), Rest()], selector=rule).train(quiet=True)
+    assert len(run.evaluate(2).returns) == 2
+
+
+def never(self, step):
+    return step.goal["at"][:, 0] > 9
+
+
+def nested():
+    """A skill with goals of parts, some of whole numbers."""
+    how = {"reward": lambda self, step: step.goal["at"].sum(1), "termination": never}
+    return go_to(goal_space=NESTED, success=never, **how)
 
 
 AT = {"at": (0.5, -0.5), "byte": (1, 2)}
@@ -181,7 +148,7 @@ def rows_of(goal, n):
 )
 def test_a_function_gives_goals_of_several_parts(goals, space, wanted):
     rule = lambda obs: (["go_to"] * len(obs), goals(obs))  # noqa: E731
-    skill = go_to("tuple") if space is None else skill_of(space)
+    skill = go_to("tuple") if space is None else nested()
     run = declared([skill, Rest()], selector=rule).train(quiet=True)
     player = run.player()
     player.act(np.ones(2, np.float32))

@@ -64,22 +64,27 @@ def rest(obs):
     return np.full(len(obs), "rest")
 
 
-@pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", ["SAC", "PPO, recurrent", "PPO", "DQN", "TD3"])
-def test_an_interrupted_run_ends_with_the_same_weights(name, tmp_path):
+@pytest.mark.fast_cases(2)
+@pytest.mark.parametrize(
+    ("name", "space"),
+    [
+        ("SAC", "dict"),
+        ("PPO", "whole"),
+        ("PPO, recurrent", "box"),
+        ("PPO", "box"),
+        ("DQN", "box"),
+        ("TD3", "box"),
+    ],
+)
+def test_an_interrupted_run_ends_with_the_same_weights(name, space, tmp_path):
     algorithm, discrete = ALGORITHMS[name]
 
     def hierarchy():
-        env = functools.partial(Point, discrete=discrete)
-        return declared(env=env, algorithm=algorithm, steps=400, train_defaults=OFTEN)
-
-    goes_on(hierarchy, tmp_path)
-
-
-@pytest.mark.parametrize("space", ["dict", "whole"])
-def test_goals_of_other_spaces_are_resumed(space, tmp_path):
-    def hierarchy():
-        return declared([go_to(space), Rest()], selector=rest, steps=400, train_defaults=OFTEN)
+        how = {"env": functools.partial(Point, discrete=discrete), "algorithm": algorithm}
+        how |= {"steps": 400, "train_defaults": OFTEN}
+        if discrete:  # what rests has actions of a Box
+            return declared([go_to(space)], **how)
+        return declared([go_to(space), Rest()], selector=rest, **how)
 
     goes_on(hierarchy, tmp_path)
 
@@ -123,7 +128,7 @@ def test_a_skill_with_goals_beside_one_without_learns_together():
             return step.next_obs[:, 0]
 
     selector = sw.PPO(num_envs=4, n_steps=64, batch_size=16, network=SMALL)
-    hierarchy = declared([Right(), go_to()], selector=selector, learn="together", steps=1200)
+    hierarchy = declared([Right(), go_to()], selector=selector, learn="together", steps=600)
     run = hierarchy.train(quiet=True)
     assert run.evaluate(3, skill="go_to").skills["go_to"].calls == 3
 

@@ -7,49 +7,11 @@ import torch
 from worlds import ON, SMALL, SPACES, GoTo, Point, Rest, declared, go_to
 
 import skillweave as sw
-from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
+from skillweave.errors import PolicyError, RunError, SkillError
 from skillweave.evolution import Evolution
 from skillweave.skills.goal_spaces import draw_from, shown_goal, with_goal
 from skillweave.skills.goals import goals_of
 from skillweave.spaces import obs_dtype
-
-
-@pytest.mark.parametrize(
-    ("goals", "says"),
-    [
-        (
-            lambda self, obs, rng: obs[0],
-            r"goals\(\) gave goals of shape \(2,\) for skill .* but \(4, 2\) was",
-        ),
-        (lambda self, obs, rng: None, r"goals\(\) returned None"),
-        (lambda self, obs, rng: obs.astype(str), r"goals\(\) gave goals of <U.*are numbers"),
-        (lambda self, obs, rng: obs + 7, r"goals\(\) gave the goal .* out of goal_space Box"),
-        (lambda self, obs, rng: obs.no, r"goals\(\) raised AttributeError"),
-    ],
-)
-def test_goals_that_are_wrong(goals, says):
-    with pytest.raises(SkillError, match=says):
-        declared([go_to(goals=goals)]).train(quiet=True)
-
-
-UNSUPPORTED = {
-    "text": (gym.spaces.Text(4), r"goal_space Text.* is not supported; supported are: Box"),
-    "part": (
-        gym.spaces.Dict(at=SPACES["box"], word=gym.spaces.Text(4)),
-        r"the part word of the goal_space, Text.* is not supported",
-    ),
-    "empty": (gym.spaces.Box(-1, 1, (0,), np.float32), "which holds no number: leave it out"),
-    "names": (gym.spaces.Dict({1: SPACES["box"]}), "each with text as its name"),
-}
-
-
-@pytest.mark.parametrize(("space", "says"), UNSUPPORTED.values(), ids=UNSUPPORTED)
-@pytest.mark.parametrize("learns", [True, False])
-def test_a_space_that_is_not_supported_is_named_with_its_skill(space, says, learns):
-    how = {} if learns else {"policy": lambda self, obs, goal: obs}
-    skill = type("GoTo", (GoTo,), {"goal_space": space, **how})()
-    with pytest.raises(DeclarationError, match=f"skill 'go_to': .*{says}"):
-        declared([skill]).train(quiet=True)
 
 
 def test_a_reward_that_ignores_the_goal_is_said(capsys):
@@ -61,10 +23,10 @@ def test_a_reward_that_ignores_the_goal_is_said(capsys):
         def reward(self, step):
             return step.next_obs[:, 0]
 
-    declared([Blind()]).train()
+    declared([Blind()], steps=64).train()
     said = capsys.readouterr()
     assert "none reads step.goal" in said.out + said.err
-    declared([go_to()]).train()
+    declared([go_to()], steps=64).train()
     said = capsys.readouterr()
     assert "none reads step.goal" not in said.out + said.err
 
@@ -85,39 +47,20 @@ def walks():
     return declared([Walk()]).train(quiet=True)
 
 
-def test_a_player_takes_a_goal(walks):
-    player = walks.player(skill="go_to", goal=(0.5, -0.5))
-    assert np.allclose(player.act(ZERO), (0.5, -0.5))
-    player.reset(goal=(0.25, 0.0))
-    assert np.allclose(player.act(ZERO), (0.25, 0.0))
-    with pytest.raises(SkillError, match=r"the player gave the goal .* out of goal_space"):
-        walks.player(skill="go_to", goal=(5, 5))
-    shape = r"gave a goal of shape \(1,\) for skill 'go_to', but \(2,\) was expected: one of Box"
-    with pytest.raises(SkillError, match=shape):
-        walks.player(skill="go_to", goal=(0.5,))
-    with pytest.raises(DeclarationError, match=r"does not fit Box.*without an axis"):
-        player.act(np.zeros((1, 2), np.float32))
-    room = sw.Hierarchy(lambda: Point(as_dict=True), [Rest()], selector=lambda obs: [0] * len(obs))
-    player = room.train(quiet=True).player()
-    with pytest.raises(DeclarationError, match=r"does not fit Dict.*: obs has no part 'picture'"):
-        player.act({"place": ZERO})
-    with pytest.raises(
-        DeclarationError, match=r"does not fit Dict.*: obs is an array of shape \(2,"
-    ):
-        player.act(ZERO)
-    with pytest.raises(DeclarationError, match="policy that takes none: name a skill"):
-        walks.player(goal=(0, 0))
-
-
-@pytest.mark.parametrize("goal", [(5, 5), (1, 2, 3), "x", (0.1, (0.2, 0.3)), {"at": 1}, np.nan])
-def test_a_refused_goal_leaves_the_player_as_it_was(goal, walks):
-    player = walks.player(skill="go_to", goal=(0.5, -0.5))
-    player.act(ZERO)
-    with pytest.raises(SkillError, match="the player gave"):
-        player.reset(goal=goal)
+def test_a_player_takes_a_goal_and_keeps_its_own(walks):
+    goal = np.array([0.5, -0.5], np.float32)
+    player = walks.player(skill="go_to", goal=goal)
+    goal[:] = 0.1
     assert np.allclose(player.act(ZERO), (0.5, -0.5))
     player.reset()
     assert np.allclose(player.act(ZERO), (0.5, -0.5))
+    player.reset(goal=(0.25, 0.0))
+    assert np.allclose(player.act(ZERO), (0.25, 0.0))
+    for refused in ((5, 5), (1, 2, 3), "x", (0.1, (0.2, 0.3)), {"at": 1}, np.nan):
+        with pytest.raises(SkillError, match="the player gave"):
+            player.reset(goal=refused)
+        assert np.allclose(player.act(ZERO), (0.25, 0.0)), "it is as it was"
+        player.reset()
 
 
 def test_a_player_never_acts_without_its_goal():
@@ -135,34 +78,6 @@ def test_a_player_never_acts_without_its_goal():
         with pytest.raises(SkillError, match=r"clip_goal\(\) gave the goal \[5.0, 5.0\]"):
             player.act(ZERO)
     assert np.allclose(player.act(np.float32([0.5, 0])), (0.5, 1))
-
-
-def test_a_player_keeps_its_own_goal(walks):
-    goal = np.array([0.5, 0.5], np.float32)
-    player = walks.player(skill="go_to", goal=goal)
-    goal[:] = 0.1
-    assert np.allclose(player.act(ZERO), 0.5)
-    goal[:] = -0.5
-    assert np.allclose(player.act(ZERO), 0.5)
-    player.reset()
-    assert np.allclose(player.act(ZERO), 0.5)
-
-
-@pytest.mark.parametrize(
-    ("space", "goal", "says"),
-    [
-        ("bits", (257, 0), r"gave the goal \[257, 0\], which is out of goal_space MultiBinary"),
-        ("dict", {"at": (0, 0)}, "a dict with 'at', 'side' was expected"),
-        ("dict", {"at": (0, 5), "side": 1}, "out of goal_space"),
-        ("dict", {"at": (0,), "side": 1}, r"\(1, 2\) was expected: .* for one environment$"),
-        ("tuple", 3, "gave"),
-    ],
-)
-def test_a_player_says_which_goal_is_wrong(space, goal, says):
-    selector = sw.tree.Sequence(("go_to", lambda obs: obs))  # it is never asked
-    run = declared([go_to(space)], selector=selector).train(quiet=True)
-    with pytest.raises(SkillError, match=says):
-        run.player(skill="go_to", goal=goal)
 
 
 def test_goals_beyond_the_range_of_a_policy_are_said(recwarn):
@@ -196,15 +111,6 @@ def test_policies_from_elsewhere_take_the_goal():
     with torch.no_grad():
         expected = network(torch.from_numpy(np.concatenate([obs, goal])))
     assert np.allclose(action, expected.clamp(-1, 1), atol=1e-5)
-
-    for policy, says in [
-        (lambda obs: obs, r"takes no goal, but its skill has goals: let the function take it"),
-        (torch.nn.Linear(2, 2), r"takes no goal.*write Goal\(\) at its place in sees"),
-    ]:
-        skill = type("GoTo", (Rest,), {"policy": staticmethod(policy), "goal_space": SPACES["box"]})
-        skill.name = "go_to"
-        with pytest.raises(PolicyError, match=says):
-            declared([skill()]).check_spaces()
 
 
 WIDER = gym.spaces.Box(-2, 2, (2,), np.float32)
@@ -360,8 +266,8 @@ SELECTORS = {
 def test_evolution_with_goals(stage, learns_by):
     evolution = Evolution(population=2, generations=2, episodes=1)
     late = type("Late", (Rest,), {"initiation": lambda self, obs: obs[:, 0] > 0})()
-    how = {"selector": SELECTORS[learns_by], "steps": 900}
+    how = {"selector": SELECTORS[learns_by], "steps": 600}
     run = declared([go_to("number"), late], **how).train(
-        evolve={stage: evolution}, eval_every=300, quiet=True
+        evolve={stage: evolution}, eval_every=200, quiet=True
     )
     assert run.evaluate(2, skill="go_to").skills["go_to"].calls == 2

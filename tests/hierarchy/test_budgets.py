@@ -42,6 +42,7 @@ def declare(*skills, **how) -> Hierarchy:
 CASES = {
     "together": ({"steps": 900}, {"together": 900}),
     "by default, a million": ({}, {"together": 1_000_000}),
+    "lengths": ({"call_steps": Lengths(4, 8), "selector": PPO()}, {"together": 1_000_000}),
     "a budget of its own": ({"together": Together(steps=50)}, {"together": 50}),
     "apart: a share for each skill, two for the selector": (
         {"steps": 400, "learn": "apart"},
@@ -55,6 +56,7 @@ CASES = {
         {"steps": 801, "learn": "apart, then together"},
         {"one": 100, "two": 100, "selector": 200, "together": 401},
     ),
+    "no skill learns": ({"skills": [Ready()], "steps": 300}, {"selector": 300}),
     "a ready selector takes none": (
         {"steps": 400, "learn": "apart", "selector": lambda obs: obs[:, 0] > 0},
         {"one": 200, "two": 200},
@@ -65,10 +67,12 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_steps_are_split_as_the_hierarchy_learns(case):
     how, budgets = CASES[case]
-    found = declare(**how)
+    found = declare(*how.get("skills", ()), **{k: v for k, v in how.items() if k != "skills"})
     assert found.budgets() == budgets
     assert found.total_steps == sum(budgets.values())
     assert {s.name: s.budget for s in found.stages()} == budgets
+    whole = [s for s in found.stages() if s.name in ("selector", "together")]
+    assert all(s.kind == s.name for s in whole)
     assert found.plain_agent().steps == found.total_steps
 
 
@@ -86,6 +90,9 @@ def test_a_total_beside_all_its_parts_is_refused(parts):
     declare(steps=found.total_steps, **parts)
     found.scale(2.0)
     found.validate()
+    with pytest.raises(SkillweaveError, match=r"apart\.skill_steps"):
+        apply_overrides(declare(learn="apart"), ["steps=400", "apart.skill_steps=7"])
+    apply_overrides(declare(learn="apart"), ["steps=400", "apart.skill_steps=100"])
 
 
 @pytest.mark.parametrize("parts", [{}, *PARTS, {"learn": "apart", "apart": Apart(skill_steps=7)}])
@@ -97,18 +104,20 @@ def test_steps_set_by_name_are_the_total_and_keep_the_shares(parts):
         assert found.budgets()[name] == pytest.approx(steps * 5e5 / before.total_steps, abs=3)
 
 
-def test_a_total_that_contradicts_a_part_by_name_is_refused():
-    with pytest.raises(SkillweaveError, match=r"apart\.skill_steps"):
-        apply_overrides(declare(learn="apart"), ["steps=400", "apart.skill_steps=7"])
-    apply_overrides(declare(learn="apart"), ["steps=400", "apart.skill_steps=100"])
-
-
 def test_a_skills_own_steps_replace_its_part():
     class Long(Skill):
         steps = 1_000
 
-    found = declare(One(), Long(), steps=400, learn="apart")
+    found = declare(One(), Long(), Ready(), steps=400, learn="apart")
     assert found.budgets() == {"one": 100, "long": 1_000, "selector": 200}
+    own = declare(One(), Long(), learn="apart", apart=Apart(skill_steps=7, selector_steps=8))
+    assert own.budgets() == {"one": 7, "long": 1_000, "selector": 8}
+    found.scale(0.1)
+    assert found.budgets() == {"one": 10, "long": 100, "selector": 20}
+    assert Long.steps == 1_000, "scaling one declaration changed the class"
+    for factor in (0.0, -1.0, float("inf"), float("nan")):
+        with pytest.raises(SkillweaveError, match="scale"):
+            found.scale(factor)
 
 
 def test_a_hierarchy_below_takes_a_share_for_each_who_learns_in_it():
@@ -127,34 +136,27 @@ def test_a_hierarchy_below_takes_a_share_for_each_who_learns_in_it():
     assert (found.steps, inner.steps) == (350, 20)
 
 
-def test_where_no_skill_learns_the_selector_trains_alone():
-    found = declare(Ready(), steps=300)
-    assert found.budgets() == {"selector": 300}
-    assert [s.kind for s in found.stages()] == ["selector"]
-
-
 def test_by_default_all_learn_together_and_skills_feel_the_task():
     (stage,) = declare().stages()
     assert stage.together == Together()
     assert stage.together.task_weight == 1.0
     assert list(stage.beside) == ["one", "two", "skill_critic"]
     assert stage.task_weights == {}
+    (stage,) = declare(algorithm=DQN()).stages()
+    assert list(stage.beside) == ["one", "two"], "who learns from replay does not feel it"
 
 
 def test_a_skill_keeps_to_its_own_reward_where_it_says_so():
-    class Own(Skill):
-        task_weight = 0.0
-
-    (stage,) = declare(One(), Own()).stages()
+    own = type("Own", (Skill,), {"task_weight": 0.0})
+    (stage,) = declare(One(), own()).stages()
     assert stage.task_weights == {"own": 0.0}
     assert stage.entry().task_weights == {"own": 0.0}
-    alone = declare(Own()).stages()[0]
+    alone = declare(own()).stages()[0]
     assert "skill_critic" not in alone.beside, "no skill needs what the critic says"
-
-
-def test_skills_that_learn_from_replay_need_no_critic_of_the_task():
-    (stage,) = declare(algorithm=DQN()).stages()
-    assert list(stage.beside) == ["one", "two"]
+    # The weight of a hierarchy holds for the skills in it.
+    how = {"policy": declare(One(), Two(), name="below"), "task_weight": 0.5}
+    (stage,) = declare(One(), type("Inner", (Skill,), how)()).stages()
+    assert stage.task_weights == {"inner/one": 0.5, "inner/two": 0.5}
 
 
 def test_nothing_is_compared_where_nothing_is_left_open():
@@ -165,21 +167,6 @@ def test_nothing_is_compared_where_nothing_is_left_open():
     assert not declare(selector=rule, selection=fixed).stages()[0].greedy_judged
     assert declare(selection=fixed).stages()[0].greedy_judged, "the selector's choice is open"
     assert declare(selector=rule).stages()[0].greedy_judged, "that of the skills is"
-
-
-def test_a_weight_of_a_hierarchy_holds_for_the_skills_in_it():
-    inner = declare(One(), Two(), name="inner")
-
-    class Inner(Skill):
-        policy, task_weight = inner, 0.5
-
-    (stage,) = declare(One(), Inner()).stages()
-    assert stage.task_weights == {"inner/one": 0.5, "inner/two": 0.5}
-
-
-def test_lengths_learn_together_too():
-    (stage,) = declare(call_steps=Lengths(4, 8), selector=PPO()).stages()
-    assert stage.kind == "together"
 
 
 LEARN = ("together", "apart", "apart, then together")

@@ -11,10 +11,12 @@ from declaring import plainly, skills_with
 from gymnasium.spaces import Box, MultiDiscrete
 from skills.foreign_models import WEIGHT, linear, onnx_file, sb3_zip
 from small_runs import acts
+from toys import World
 
 from skillweave import (
     PPO,
     Apart,
+    EnvSpec,
     Hierarchy,
     Skill,
     SkillweaveError,
@@ -36,9 +38,12 @@ def skill(name, policy, **attributes):
     return type(name, (Skill,), {"name": name, "policy": policy, **attributes})()
 
 
-def declare(*skills, env="CartPole-v1", **more):
+CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
+
+
+def declare(*skills, env=CARTPOLE, **more):
     return Hierarchy(
-        env, skills, selector=SMALL, call_steps=5, apart=Apart(selector_steps=500), **plainly(more)
+        env, skills, selector=SMALL, call_steps=5, apart=Apart(selector_steps=200), **plainly(more)
     )
 
 
@@ -228,35 +233,17 @@ def test_what_does_not_fit_is_said_before_anything_is_written(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-class Point(gym.Env):
-    """Reward for acting as the observation says; whatever actions."""
-
-    observation_space = Box(-1.0, 1.0, (3,), np.float32)
-
-    def __init__(self, action_space):
-        self.action_space = action_space
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.obs, self.t = self.np_random.uniform(-1, 1, 3).astype(np.float32), 0
-        return self.obs, {}
-
-    def step(self, action):
-        assert self.action_space.contains(action), action
-        self.t += 1
-        return self.obs, float(np.sum(action)), False, self.t == 5, {}
-
-
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("space", [Box(-0.5, 0.5, (2,), np.float32), MultiDiscrete([2, 3])])
 def test_other_actions_than_choices(tmp_path, space):
-    width = 2 if isinstance(space, Box) else 5
+    width, seen = 2 if isinstance(space, Box) else 5, Box(-1.0, 1.0, (3,), np.float32)
     weight = np.random.default_rng(0).normal(size=(3, width))
     choose = (lambda obs: obs[:, :2]) if isinstance(space, Box) else None
     choose = choose or (lambda obs: (obs[:, :2] > 0).astype(int))
     skills = [skill("net", linear(weight)), skill("function", choose)]
+    env = EnvSpec(lambda: World(seen, space), engine="sync", workers=1)
     for greedy in (True, False):
-        h = declare(*skills, env=lambda: Point(space), greedy_skills=greedy)
+        h = declare(*skills, env=env, greedy_skills=greedy)
         run = h.train(tmp_path / str(greedy), quiet=True)
         assert acts(h.load(run.path).policy, 3)[0][1] == acts(run.policy, 3)[0][1]
         assert run.evaluate(3, skill="net") == h.load(run.path).evaluate(3, skill="net")

@@ -77,21 +77,3 @@ def test_a_loaded_run_acts_by_its_recorded_mapping(tmp_path, monkeypatch):
     for loaded in (declare().load(run.path), declare().load_weights(weights)):
         assert loaded.evaluate(2, skill="swing").returns == wanted
     assert sw.evaluate(other, "Pendulum-v1", episodes=2).returns != wanted
-
-
-def test_a_hierarchy_of_mapped_skills_is_exported_and_loaded(tmp_path):
-    pytest.importorskip("onnxscript")
-    from skillweave.export.runner import Runner
-
-    run = declare().train(tmp_path / "run", seed=3, quiet=True)
-    export = run.export(tmp_path / "out")
-    runner, player = Runner(tmp_path / "out", export.functions), run.player()
-    loaded = sw.Player(sw.load_policy(tmp_path / "out", code=export.functions))
-    rng, skills = np.random.default_rng(0), set()
-    for _ in range(60):
-        obs = rng.uniform(-1, 1, 3).astype(np.float32)
-        action = player.act(obs)
-        np.testing.assert_allclose(runner.act(obs), action, atol=1e-5)
-        np.testing.assert_allclose(loaded.act(obs), action, atol=1e-5)
-        skills.add(int(player.memory["skill"][0]))
-    assert skills == {0, 1}

@@ -10,15 +10,12 @@ import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from reference_calls import EPISODE, POSITION, TAG, Counter, Die, Left, Right, T, Walk, Zigzag
-from toys import cartpole, network_of, skills_of
+from toys import network_of, skills_of
 
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillError, SkillweaveError
 from skillweave.hierarchy.options_env import OptionsEnv
-from skillweave.skills import Skill
-from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.skills.skill_set import SkillSet
-from skillweave.types import Step
 
 torch.set_num_threads(1)
 N = 5
@@ -204,6 +201,8 @@ def test_a_seed_reproduces_everything_another_does_not_and_no_seed_goes_on(optio
     assert after[1] != first
     assert after[2] != after[1]
     assert (play(3), play(None), play(None)) == after
+    with pytest.raises(SkillweaveError, match="one seed"):
+        env.reset(seed=[1] * N)
 
 
 def test_what_was_returned_is_not_changed_by_later_steps(options):
@@ -221,11 +220,6 @@ def test_what_was_returned_is_not_changed_by_later_steps(options):
         np.testing.assert_array_equal(x, copy)
 
 
-def test_a_list_of_seeds_is_an_error_for_people(options):
-    with pytest.raises(SkillweaveError, match="one seed"):
-        options(skill_set(*ALL)).reset(seed=[1] * N)
-
-
 def test_gymnasiums_own_vector_wrapper_counts_its_episodes(options):
     env = RecordEpisodeStatistics(options(skill_set(Left, Zigzag, call_steps=2), gamma=1.0))
     if "SAME_STEP" not in inspect.getsource(RecordEpisodeStatistics.step):
@@ -240,91 +234,6 @@ def test_gymnasiums_own_vector_wrapper_counts_its_episodes(options):
             running[i] = 0
             counted += 1
     assert counted > 10
-
-
-# EnvPool -------------------------------------------------------------------------------------
-
-
-class Push(Skill):
-    """CartPole: to the left."""
-
-    max_steps = 2
-    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), None, None)
-
-
-class Balance(Skill):
-    """CartPole: against the fall, while the cart is left of the middle."""
-
-    policy = ScriptedPolicy(lambda obs: (obs[:, 2] + obs[:, 3] > 0).astype(np.int64), None, None)
-
-    def initiation(self, obs):
-        return obs[:, 0] < 0.05
-
-    def termination(self, step):
-        return np.abs(step.next_obs[:, 1]) > 0.4
-
-
-@pytest.mark.usefixtures("no_trials")
-@pytest.mark.filterwarnings("ignore:.*precision lowered")
-@pytest.mark.usefixtures("unprobed")
-def test_envpool_steps_only_those_whose_calls_go_on(options):
-    pytest.importorskip("envpool")
-    told = []
-
-    class Told(Balance):
-        """Balance, from anywhere, that writes down how EnvPool counts its environments' steps."""
-
-        def initiation(self, obs):
-            return np.ones(len(obs), bool)
-
-        def termination(self, step):
-            told.extend(zip(step.info["env_id"], step.info["elapsed_step"], strict=True))
-            return super().termination(step)
-
-    env = options(skill_set(Push, Told, call_steps=7), "CartPole-v1", 0.9, 4, engine="envpool")
-    assert type(env.engine).__name__ == "EnvPoolEngine"
-    rng = np.random.default_rng(0)
-    obs, _ = env.reset(seed=5)
-    elapsed, skills = np.zeros(4, int), env.skills.skills
-    different, ends = 0, 0
-    for _ in range(40):
-        choice = rng.integers(2, size=4)
-        told.clear()
-        before = obs.copy()
-        obs, reward, terminated, truncated, info = env.step(choice)
-        for i, c in enumerate(choice):
-            skill, now = skills[c], before[i]
-            for tau in range(1, 8):
-                action = skill.policy.act({}, now[None])[0]
-                was, now = now, cartpole(now, action[0])
-                fell = abs(now[0]) > 2.4 or abs(now[2]) > 12 * np.pi / 180
-                step = Step(
-                    was[None], action, now[None], np.ones(1), np.array([fell]), np.array([False]),
-                    np.array([False]), np.array([tau]), {"env_id": [i], "elapsed_step": [-1]},
-                )  # fmt: skip
-                if fell or tau == min(7, skill.max_steps or 7):
-                    break
-                if c == 1 and Balance.termination(skill, step)[0]:
-                    break
-            assert info["steps"][i] == tau
-            np.testing.assert_allclose(info["next_obs"][i], now, atol=1e-5)
-            assert reward[i] == pytest.approx(sum(0.9**k for k in range(tau)), rel=1e-6)
-            assert info["call_return"][i] == tau
-            assert (terminated[i], truncated[i]) == (fell, False)
-            assert info["discount"][i] == pytest.approx(0.0 if fell else 0.9**tau, rel=1e-6)
-            if c == 1:
-                mine = [int(k) for j, k in told if j == i and k >= 0]
-                assert mine == list(range(elapsed[i] + 1, elapsed[i] + tau + 1))
-            elapsed[i] = 0 if fell else elapsed[i] + tau
-            if not fell:
-                assert obs[i].tolist() == info["next_obs"][i].tolist()
-            else:
-                assert np.abs(obs[i]).max() <= 0.05
-                assert np.abs(info["final_obs"][i]).max() > 0.05
-        different += len(set(info["steps"].tolist())) > 1
-        ends += int(terminated.sum())
-    assert different > 10
-    assert ends > 3
 
 
 def test_a_memory_that_no_checkpoint_could_hold_is_refused_by_the_skills_name():

@@ -24,14 +24,12 @@ from reference_calls import (
 from toys import skills_of
 
 from skillweave.api import Hierarchy, Run
-from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.envs.make import EnvSpec
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.skills import Reflex, Skill
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.skills.skill_set import SkillSet
 from skillweave.training.evaluation import evaluate
-from skillweave.training.play import SeededEpisodes, play
 from skillweave.types import Array, Step
 
 torch.set_num_threads(1)
@@ -139,40 +137,12 @@ def test_a_film_of_a_skill_alone_shows_its_reflexes_too(tmp_path):
 # Memory ----------------------------------------------------------------------------------------
 
 
-class InAnyOrder:
-    """A policy that is asked about its environments in another order every time."""
-
-    def __init__(self, policy):
-        self.policy, self.rng = policy, np.random.default_rng(0)
-        self.start, self.acting = policy.start, policy.acting
-
-    def _shuffled(self, memory, rows):
-        order = self.rng.permutation(rows)
-        return order, np.argsort(order), {k: v[order] for k, v in memory.items()}
-
-    def act(self, memory, obs, mask, **how):
-        order, back, shuffled = self._shuffled(memory, len(obs))
-        action, shuffled = self.policy.act(shuffled, obs[order], mask, **how)
-        return action[back], {k: v[back] for k, v in shuffled.items()}
-
-    def observe(self, memory, step):
-        return self.policy.observe(memory, step)
-
-
 def in_three_levels() -> HierarchyPolicy:
     inside = hierarchy(Counter, Right, Left, call_steps=2)
     for name in ("low", "middle"):
         skill = type(name, (Skill,), {"policy": inside, "max_steps": 3})
         inside = hierarchy(skill, Zigzag, call_steps=5)
     return inside
-
-
-def test_memory_rows_may_be_gathered_and_scattered_in_any_order():
-    policy, actions = in_three_levels(), []
-    for acts in (policy, InAnyOrder(policy)):
-        episodes = SeededEpisodes(make_engine(EnvSpec(Walk, engine="sync"), N), [*range(9)], 99)
-        actions.append([played.step.action.tolist() for played in play(acts, episodes)])
-    assert actions[0] == actions[1]
 
 
 def test_neither_act_nor_observe_changes_the_memory_given():
@@ -193,10 +163,6 @@ def test_neither_act_nor_observe_changes_the_memory_given():
         assert all((after[k] == kept[k]).all() for k in after)
 
 
-def walk_obs(*positions: int) -> Array:
-    return np.array([[0, 0, 0, x] for x in positions], np.float32)
-
-
 def test_where_no_skill_may_start_a_large_observation_is_told_in_part():
     class Never(Skill):
         def initiation(self, obs):
@@ -206,29 +172,6 @@ def test_where_no_skill_may_start_a_large_observation_is_told_in_part():
         skill_set(Never).hierarchy.mask(np.zeros((1, 7, 7, 3), np.uint8))
     assert len(str(found.value)) < 400
     assert "\n" not in str(found.value)
-
-
-def test_deterministic_is_about_the_selector_and_greedy_about_the_skills():
-    asked = []
-
-    class Asked(ScriptedPolicy):
-        def __init__(self, who, count):
-            self.who = who
-            super().__init__(None, Walk.observation_space, gym.spaces.Discrete(count))
-
-        def act(self, memory, obs, mask=None, *, deterministic=True, rng=None):
-            asked.append((self.who, deterministic, None if rng is None else rng.integers(100)))
-            return np.zeros(len(obs), np.int64), memory
-
-    for deterministic in (True, False):
-        for greedy in (True, False):
-            skills = SkillSet((Left(),), (Asked("skill", 3),), call_steps=2, greedy=greedy)
-            policy = HierarchyPolicy(Asked("selector", 1), skills)
-            asked.clear()
-            rng = np.random.default_rng(5)
-            policy.act(policy.start(1), walk_obs(0), deterministic=deterministic, rng=rng)
-            assert [a[:2] for a in asked] == [("selector", deterministic), ("skill", greedy)]
-            assert all(a[2] is not None for a in asked)
 
 
 def test_it_has_the_spaces_of_selector_and_skills_and_names_them():

@@ -113,16 +113,13 @@ def test_a_selector_chooses_the_goals_that_its_critic_observes():
     assert selector.observation_space == roles.spec.spaces.observation
 
 
-def test_a_table_keeps_the_settings_that_were_declared_when_it_was_made():
-    declared = three()
-    roles = roles_of(declared)
-    declared.call_steps = 5
-    assert roles.outermost.call_steps is None
-    assert roles_of(declared).outermost.call_steps == 5
-
-
 def test_a_table_is_written_into_a_copy_of_the_declaration_at_all_levels():
     declared = three()
+    kept = roles_of(declared)
+    declared.call_steps = 5
+    assert kept.outermost.call_steps is None, "a table keeps what was declared when it was made"
+    assert roles_of(declared).outermost.call_steps == 5
+    declared.call_steps = None
     roles = roles_of(declared).changed(
         lambda level: replace(level, call_steps=len(level.path) + 1, apart=Apart(start_calls=3))
     )

@@ -9,7 +9,7 @@ import pytest
 import torch
 from declaring import plainly
 
-from skillweave import PPO, Hierarchy, Network, Skill, SkillweaveError
+from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill, SkillweaveError
 from skillweave.algorithms.agent_policy import state_from
 from skillweave.cli import main
 from skillweave.compat.agilerl import agent_classes as agilerl
@@ -22,7 +22,8 @@ NAMES = "left", "right", "stay"
 def declare(names: tuple[str, ...] = NAMES) -> Hierarchy:
     skills = [type(name, (Skill,), {"name": name})() for name in names]
     how = {"skill_steps": 32, "selector_steps": 64, "call_steps": 4}
-    return Hierarchy("CartPole-v1", skills, algorithm=SMALL, selector=SMALL, **plainly(how))
+    env = EnvSpec("CartPole-v1", engine="sync", workers=1)
+    return Hierarchy(env, skills, algorithm=SMALL, selector=SMALL, **plainly(how))
 
 
 @pytest.fixture(scope="module")
@@ -50,13 +51,15 @@ def rewrite(run: Path, stage: str, tensors, header):
     write_json(run / "run.json", data)
 
 
-def test_swapped_skills_are_refused(run):
+def test_policies_in_the_place_of_others_are_refused(run):
     a, b = policy(run, "left"), policy(run, "right")
     first, second = a.read_bytes(), b.read_bytes()
     a.write_bytes(second)
     b.write_bytes(first)
     with pytest.raises(SkillweaveError, match=r"left\.safetensors holds the policy of .*'right'"):
         declare().load(run)
+    with pytest.raises(SkillweaveError, match="holds the policy of stage 'selector' alone"):
+        declare(("left", "right")).load_weights(policy(run, "selector"))
 
 
 def test_a_selector_in_the_place_of_a_skill_is_refused(run):
@@ -70,11 +73,6 @@ def test_a_selector_in_the_place_of_a_skill_is_refused(run):
         policy(run, target).write_bytes(before)
         (run / "run.json").write_bytes(manifest)
     declare().load(run).evaluate(1)
-
-
-def test_a_selector_alone_is_no_flat_agent(run):
-    with pytest.raises(SkillweaveError, match="holds the policy of stage 'selector' alone"):
-        declare(("left", "right")).load_weights(policy(run, "selector"))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
@@ -143,7 +141,7 @@ def test_a_flat_agents_damaged_header_is_told_by_the_command_line(run, tmp_path,
         assert "is 5; it must be" in capsys.readouterr().err
 
 
-def test_an_agents_state_of_another_shape_or_type_is_refused(tmp_path):
+def test_an_agents_state_of_another_shape_or_type_or_none_is_refused(tmp_path):
     path = tmp_path / "agent.safetensors"
     agilerl.DQN((3,), 2, False).saveCheckpoint(path)
     tensors, header = read_tensors(path)
@@ -152,12 +150,9 @@ def test_an_agents_state_of_another_shape_or_type_is_refused(tmp_path):
         write_tensors(path, tensors | {"state.mu": changed}, header)
         with pytest.raises(SkillweaveError, match="tensor mu should"):
             agilerl.DQN.load(path)
-
-
-def test_a_state_that_lacks_a_tensor_is_refused_by_name():
     state = agilerl.DQN((3,), 2, False).member.state
-    tensors = dict(vars(state))
-    assert torch.equal(state_from(tensors, state, "x").params, state.params)
-    del tensors["params"]
+    given = dict(vars(state))
+    assert torch.equal(state_from(given, state, "x").params, state.params)
+    del given["params"]
     with pytest.raises(SkillweaveError, match=r"x: tensor params should be .*found nothing"):
-        state_from(tensors, state, "x")
+        state_from(given, state, "x")

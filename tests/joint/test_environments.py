@@ -13,9 +13,7 @@ from small_runs import goes_on, reports_every
 from torch import nn
 
 import skillweave as sw
-from skillweave.errors import DeclarationError
 from skillweave.export.runner import Runner
-from skillweave.hierarchy.roles import roles_of
 from skillweave.planning import CallLog
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.plain_agent import load_agent_of
@@ -101,54 +99,6 @@ def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
     assert declared(name).load(whole.path).evaluate(3).returns == returns
 
 
-def test_each_skill_writes_its_part():
-    roles = roles_of(reach())
-    assert roles["arm"].action_space == SPACES["dict"]["arm"]
-    assert roles["grip"].action_space == SPACES["dict"]["grip"]
-    assert roles["whole"].action_space == SPACES["dict"]
-
-    def in_turn(obs):
-        return np.where(obs[:, 0] > 0, "arm", "grip")
-
-    run = reach([Arm(), Grip()], selector=in_turn, call_steps=1).train(quiet=True)
-    actions = played(run.policy)
-    assert {a["grip"] for a in actions if a["arm"].any()} == {3}  # zero is no action, but 3 is
-    assert any(a["arm"].any() for a in actions)
-    assert any(a["grip"] == 4 for a in actions if not a["arm"].any())
-    held = reach([Arm(), Grip()], selector=in_turn, call_steps=1, rest={"arm": "hold"})
-    env, player = Reach(), held.train(quiet=True).player()
-    obs, _ = env.reset(seed=0)
-    for i in range(10):
-        is_arm = obs[0] > 0
-        obs, *_ = env.step(player.act(obs))
-        if not is_arm and i:
-            assert (env.actions[i]["arm"] == env.actions[i - 1]["arm"]).all()
-
-
-def test_scripts_and_reflexes_return_dicts():
-    best = sw.evaluate(sw.from_function(by_hand), on(), episodes=2)
-    assert np.allclose(best.returns, 10.0)
-    held = sw.from_function(by_hand, every=2)
-    assert sw.evaluate(held, on(), episodes=2).mean < 9
-    shut = sw.Reflex(lambda obs: obs[:, 0] > 0, {"arm": [0.5, 0.5], "grip": 4})
-
-    def opened(obs):
-        return {**by_hand(obs), "grip": np.full(len(obs), 3)}
-
-    computed = sw.Reflex(lambda obs: obs[:, 0] < -0.5, opened)
-    run = reach([Ready(), Whole()], reflexes=[shut, computed]).train(quiet=True)
-    env, player = Reach(), run.player()
-    obs, _ = env.reset(seed=0)
-    for _ in range(10):
-        seen = obs
-        obs, *_ = env.step(player.act(obs))
-        if seen[0] > 0:
-            assert (env.actions[-1]["arm"] == 0.5).all()
-            assert env.actions[-1]["grip"] == 4
-        elif seen[0] < -0.5:
-            assert env.actions[-1]["grip"] == 3
-
-
 @pytest.mark.parametrize("kind", ["dict", "tuple"])
 def test_a_script_holds_actions_of_several_parts(kind, tmp_path):
     def act(obs):
@@ -211,15 +161,6 @@ def test_calls_are_logged_and_planned_with_their_actions(tmp_path):
     assert (again.action == log.action).all()
 
 
-def test_foreign_libraries_choose_skills():
-    run = reach().train(quiet=True)
-    env = sw.envs.make_options_env(run, 2, 0.99)
-    env.reset(seed=0)
-    for skill in range(4):
-        _, reward, *_ = env.step(np.full(2, skill))
-        assert np.isfinite(reward).all()
-
-
 @pytest.mark.slow
 def test_a_film_and_a_report_play_again(tmp_path):
     run = reach(env=Reach).train(tmp_path / "run", quiet=True)
@@ -227,12 +168,3 @@ def test_a_film_and_a_report_play_again(tmp_path):
     assert (tmp_path / "film.gif").stat().st_size > 1000
     run.report(tmp_path / "report.html")
     assert (tmp_path / "report.html").stat().st_size > 10_000
-
-
-def test_a_correction_of_several_parts_says_what_works(tmp_path):
-    class Better(sw.Skill):
-        policy = sw.Residual(by_hand)
-
-    says = r"needs a Box of real numbers, .* correct one part of real numbers \(acts\)"
-    with pytest.raises(DeclarationError, match=says):
-        reach([Better()]).train(tmp_path / "run", quiet=True)

@@ -117,10 +117,3 @@ def test_actions_become_numbers_and_back(kind):
         assert (again == batch).all()
         assert units.min() == 0
         assert units.max(axis=0).tolist() == [2, 5]
-
-
-def _some(n):
-    batch = np.zeros(n, obs_dtype(SPACE))
-    for i in range(n):
-        put_observation(SPACE, batch, i, SPACE.sample())
-    return batch

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from reach import ON, SMALL, SPACES, Arm, Grip, Reach, Whole, reach
+from reach import ON, SMALL, SPACES, Arm, Grip, Reach, Whole, by_hand, reach
 from small_runs import goes_on, reports_every
 from torch.distributions import Categorical, Normal
 
@@ -29,7 +29,8 @@ class Masked(Reach):
 
     def __init__(self, kind: str = "dict", form: str = "parts", **how):
         super().__init__(kind, **how)
-        self.form = form
+        self.form, self.space = form, space_of(self.action_space)
+        self.codec = action_codec(self.action_space)
         if form == "method":
             self.action_masks = self.allowed
 
@@ -47,23 +48,21 @@ class Masked(Reach):
     def _draw(self):
         found = super()._draw()
         if self.form == "flat":
-            self.info = {"action_mask": space_of(self.action_space).allowed(self.allowed())}
+            self.info = {"action_mask": self.space.allowed(self.allowed())}
         elif self.form == "parts":
             self.info = {"action_mask": self.allowed()}
         return found
 
     def step(self, action):
-        mask = space_of(self.action_space).allowed(self.allowed())
-        assert mask[_numbers(action, self.action_space)].all(), (action, self.steps)
+        mask = self.space.allowed(self.allowed())
+        assert mask[self.numbers(action)].all(), (action, self.steps)
         return super().step(action)
 
-
-def _numbers(action, space):
-    """Return the places in a mask of the choices that an action makes."""
-    codec = action_codec(space)
-    packed = np.zeros((1, *obs_shape(space)), obs_dtype(space))
-    put_observation(space, packed, 0, action)
-    return np.cumsum([0, *codec.counts[:-1]]) + space_of(space).choices_in(packed)[0]
+    def numbers(self, action):
+        """Return the places in a mask of the choices that an action makes."""
+        packed = np.zeros((1, *obs_shape(self.action_space)), obs_dtype(self.action_space))
+        put_observation(self.action_space, packed, 0, action)
+        return np.cumsum([0, *self.codec.counts[:-1]]) + self.space.choices_in(packed)[0]
 
 
 def masked(kind: str = "dict", form: str = "parts") -> sw.EnvSpec:
@@ -86,13 +85,12 @@ def test_no_one_does_what_is_forbidden(kind, form, tmp_path):
 
 @pytest.mark.parametrize("kind", SIZES)
 def test_random_actions_are_allowed(kind):
-    space, rng = SPACES[kind], np.random.default_rng(0)
-    env = Masked(kind, "method")
+    rng, env = np.random.default_rng(0), Masked(kind, "method")
     env.reset(seed=0)
-    mask = np.tile(space_of(space).allowed(env.allowed()), (20, 1))
-    for action in random_actions(space, 20, rng, mask):
-        assert space.contains(space_of(space).unpacked(action))
-        assert mask[0][_numbers(space_of(space).unpacked(action), space)].all()
+    mask = np.tile(env.space.allowed(env.allowed()), (20, 1))
+    for action in map(env.space.unpacked, random_actions(SPACES[kind], 20, rng, mask)):
+        assert SPACES[kind].contains(action)
+        assert mask[0][env.numbers(action)].all()
 
 
 @pytest.mark.fast_cases(1)
@@ -123,19 +121,16 @@ def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
 
 
 def test_the_rest_of_the_action_may_be_forbidden(tmp_path):
-    with pytest.raises(SkillError, match=r"forbids the value 0 at choice 0 .* another rest"):
-        reach([Arm(), Grip()], env=masked()).train(tmp_path / "run", quiet=True)
-
-
-def test_choices_of_a_part_may_all_be_forbidden(tmp_path):
-    class First(sw.Skill):
-        acts = 0
-
-    env = masked("whole")
-    with pytest.raises(SkillError, match=r"forbids the value 0 at place 1"):
-        reach([First()], env=env).train(tmp_path / "run", quiet=True)
+    first = type("First", (sw.Skill,), {"acts": 0})()
+    whole = masked("whole")
+    for skills, env, where in (
+        ([Arm(), Grip()], masked(), "choice 0"),
+        ([first], whole, "place 1"),
+    ):
+        with pytest.raises(SkillError, match=rf"forbids the value 0 at {where}.* another rest"):
+            reach(skills, env=env).train(tmp_path / "run", quiet=True)
     # The middle of the first number is 0 from -1 on, and the second may be 4.
-    reach([First()], env=env, rest=[0, 4], steps=64).train(tmp_path / "two", quiet=True)
+    reach([first], env=whole, rest=[0, 4], steps=64).train(tmp_path / "two", quiet=True)
 
 
 def test_log_probabilities_are_those_of_the_allowed_choices():
@@ -175,7 +170,9 @@ WRONG = {
 
 @pytest.mark.parametrize(("mask", "says"), WRONG.values(), ids=WRONG)
 def test_a_wrong_mask_names_its_part(mask, says, tmp_path):
-    policy = sw.train_agent(masked(), ON, 64, tmp_path / "run", quiet=True).policy
+    policy = sw.from_function(
+        by_hand, observation_space=Reach.observation_space, action_space=SPACES["dict"]
+    )
     with pytest.raises(DeclarationError, match=says):
         sw.Player(policy).act(np.zeros(3, np.float32), mask=mask)
     spec = sw.EnvSpec(lambda: Reach(info={"action_mask": mask}), workers=1)

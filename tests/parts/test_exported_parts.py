@@ -62,29 +62,23 @@ def test_learnt_skills_with_parts(sees, tmp_path):
     exported(run, tmp_path / "out")
 
 
-def test_bits_with_parts(tmp_path):
-    env = sw.EnvSpec(lambda: Crane("bits"), engine="sync", workers=1)
-    run = greedy(skills(("hook", "mode")), env=env, selector=in_turn, rest="hold")
-    export = run.export(tmp_path / "out")
-    actors = run.player(), runner_of(export), sw.Player(loaded_of(export))
-    for action, *others in episode(Crane("bits"), *actors):
-        assert all(np.array_equal(theirs, action) for theirs in others)
-
-
 def middle(obs: Any) -> Any:
     return np.concatenate([-0.5 * obs["arm"], -0.25 * obs["hook"]], axis=1)
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", ["module", "every"])
+@pytest.mark.parametrize("name", ["module", "every", "hierarchy"])
 def test_corrections(name, tmp_path):
     torch.manual_seed(0)
     base = {
-        "every": sw.from_function(lambda obs: middle(obs)[:, :2], every=3),
-        "module": sw.from_torch(nn.Linear(3, 2), sees=("arm", "hook")),
-    }[name]
-    skill = type("Better", (sw.Skill,), {"policy": sw.Residual(base, 0.5), "acts": (0, 2)})()
-    exported(greedy([skill], rest=(0.0, 0.25, 0.0)), tmp_path / "out")
+        "every": lambda: sw.from_function(lambda obs: middle(obs)[:, :2], every=3),
+        "module": lambda: sw.from_torch(nn.Linear(3, 2), sees=("arm", "hook")),
+        "hierarchy": lambda: greedy().policy,
+    }[name]()
+    whole = name == "hierarchy"
+    how = {"policy": sw.Residual(base, 0.5), "acts": None if whole else (0, 2)}
+    skill = type("Better", (sw.Skill,), how)()
+    exported(greedy([skill], rest="zero" if whole else (0.0, 0.25, 0.0)), tmp_path / "out")
 
 
 ARM: Any = gym.spaces.Box(-1, 1, (2,), np.float32)
@@ -199,9 +193,3 @@ def test_a_plan_of_skills_with_goals_and_parts(tmp_path: Any) -> None:
         for _ in alike(Crane(), player, runner, seed=seed):
             goals.add(str(planned.policy.goal_now(runner.memory)))
     assert len(goals) > 5
-
-
-@pytest.mark.slow
-def test_a_hierarchy_that_a_skill_corrects(tmp_path):
-    skill = type("Better", (sw.Skill,), {"policy": sw.Residual(greedy().policy)})()
-    exported(greedy([skill]), tmp_path / "out")

@@ -88,61 +88,55 @@ def test_places_are_given_in_the_same_kinds_everywhere(places):
     assert mine(sees=places, acts=places).validate() is None
     outside = sw.from_function(lambda x: x, sees=places, acts=places).mapping
     assert outside == sw.from_function(lambda x: x, sees=(2, 0), acts=(2, 0)).mapping
+    for place in (2, np.int64(2)):  # a place alone
+        assert part(place).part.see(observations()).shape == (4, 1)
+        assert part(acts=place).action_space == Box(BOX.low[[2]], BOX.high[[2]], dtype=np.float32)
+        assert sw.from_function(lambda x: x, acts=place).mapping.acts == sw.Acts(to=(2,))
+        assert sw.Part(places=place) == sw.Part(places=(2,))
 
 
-@pytest.mark.parametrize("place", [2, np.int64(2)])
-def test_a_place_alone_is_given_everywhere(place):
-    assert part(place).part.see(observations()).shape == (4, 1)
-    assert part(acts=place).action_space == Box(BOX.low[[2]], BOX.high[[2]], dtype=np.float32)
-    assert sw.from_function(lambda x: x, acts=place).mapping.acts == sw.Acts(to=(2,))
-    assert sw.Part(places=place) == sw.Part(places=(2,))
+TWO_OF_BOX = Box(BOX.low[[2, 0]], BOX.high[[2, 0]], dtype=np.float32)
+MATRIX = Box(-1, 1, (2, 2), np.float64)
+SEVERAL = MultiDiscrete([3, 4, 2], start=[1, 0, 5])
+LAST_BITS = np.array([[1, 1, 0]], np.int8)
+BY_HAND: dict[str, tuple[Any, ...]] = {
+    "a box": (BOX, (2, 0), (0.0, 1.5, 0.0), TWO_OF_BOX, [0.5, -0.5], [-0.5, 1.5, 0.5]),
+    "by Acts": (BOX, sw.Acts(to=(2, 0)), 0.0, TWO_OF_BOX, [0.5, -0.5], [-0.5, 0, 0.5]),
+    "by an array": (BOX, sw.Acts(to=np.array([2, 0])), 0.0, TWO_OF_BOX, [0, 1], [1, 0, 0]),
+    "a matrix": (
+        MATRIX, slice(1, 3), 0.25, Box(-1, 1, (2,), np.float64),
+        [0.5, -0.5], [[0.25, 0.5], [-0.5, 0.25]],
+    ),
+    "several choices": (
+        SEVERAL, (2, 0), (1, 3, 5), MultiDiscrete([2, 3], start=[5, 1]), [6, 3], [3, 3, 6]
+    ),
+    "bits": (MultiBinary(3), (1,), "hold", MultiBinary(1), [0], [1, 0, 0]),
+    "one choice": (Discrete(5, start=10), (4, 1), "zero", Discrete(2), 1, 11),
+}  # fmt: skip
+"""A space, what is written and the rest; the part's space, an action in it, and the whole one."""
 
 
-@pytest.mark.parametrize("acts", [*PLACES, sw.Acts(to=(2, 0)), sw.Acts(to=np.array([2, 0]))])
-def test_its_numbers_of_a_box(acts):
-    own = part(acts=acts, rest=(0.0, 1.5, 0.0))
-    assert own.action_space == Box(BOX.low[[2, 0]], BOX.high[[2, 0]], dtype=np.float32)
-    action = own.part.write(np.array([[0.5, -0.5]], np.float32), None)
-    assert action.dtype == np.float32
-    assert action.tolist() == [[-0.5, 1.5, 0.5]]
-
-
-def test_its_numbers_of_a_matrix():
-    space = Box(-1, 1, (2, 2), np.float64)
-    own = part(acts=slice(1, 3), space=space, rest=0.25)
-    action = own.part.write(np.array([[0.5, -0.5]]), None)
-    assert action.tolist() == [[[0.25, 0.5], [-0.5, 0.25]]]
+@pytest.mark.parametrize(("space", "acts", "rest", "own", "mine", "whole"), BY_HAND.values())
+def test_it_writes_its_part_of_an_action(space, acts, rest, own, mine, whole):
+    found = part(acts=acts, space=space, rest=rest)
+    assert found.action_space == own
+    action = found.part.write(np.array([mine], own.dtype), LAST_BITS)
+    assert (action.tolist(), action.dtype) == ([whole], space.dtype)
     assert space.contains(action[0])
 
 
-def test_its_choices_of_several():
-    space = MultiDiscrete([3, 4, 2], start=[1, 0, 5])
-    own = part(acts=(2, 0), space=space, rest=(1, 3, 5))
-    assert own.action_space == MultiDiscrete([2, 3], start=[5, 1])
-    action = own.part.write(np.array([[6, 3]]), None)
-    assert action.tolist() == [[3, 3, 6]]
-    assert action.dtype == space.dtype
-    mask = np.ones((1, 9), bool)
-    mask[0, [1, 7]] = False  # the second choice of place 0, the first of place 2
-    assert own.part.mask(mask).tolist() == [[False, True, True, False, True]]
+MASKS: dict[str, tuple[Any, ...]] = {
+    "several": (SEVERAL, (2, 0), [1, 0, 1, 1, 1, 1, 1, 0, 1], [0, 1, 1, 0, 1]),
+    "bits": (MultiBinary(3), (1,), [1, 1, 0, 1, 1, 0], [0, 1]),
+    "one": (Discrete(5, start=10), (4, 1), [1, 1, 1, 1, 0], [0, 1]),
+    "none is left": (Discrete(5, start=10), (4, 1), [1, 0, 1, 1, 0], [1, 1]),
+}
 
 
-def test_its_bits():
-    own = part(acts=(1,), space=MultiBinary(3), rest="hold")
-    assert own.action_space == MultiBinary(1)
-    last = np.array([[1, 1, 0]], np.int8)
-    assert own.part.write(np.array([[0]], np.int8), last).tolist() == [[1, 0, 0]]
-    mask = np.array([[1, 1, 0, 1, 1, 0]], bool)
-    assert own.part.mask(mask).tolist() == [[False, True]]
-
-
-def test_its_choices_of_one():
-    space = Discrete(5, start=10)
-    own = part(acts=(4, 1), space=space)
-    assert own.action_space == Discrete(2)
-    assert own.part.write(np.array([0, 1, 0]), None).tolist() == [14, 11, 14]
-    mask = np.array([[1, 1, 1, 1, 0], [0, 0, 0, 0, 0]], bool)
-    assert own.part.mask(mask).tolist() == [[False, True], [True, True]]  # all where none is left
+@pytest.mark.parametrize(("space", "acts", "mask", "own"), MASKS.values(), ids=MASKS)
+def test_it_sees_its_part_of_a_mask(space, acts, mask, own):
+    found = part(acts=acts, space=space).part.mask(np.array([mask], bool))
+    assert found.tolist() == [[bool(x) for x in own]]
 
 
 ROBOT = Dict(
@@ -166,22 +160,20 @@ def test_its_names_of_a_dict():
     action = alone.part.write(np.full((1, 2), 0.5, np.float32), None)
     assert action["arm"]["joints"].tolist() == [[0.5, 0.5]]
     assert action["hand"].tolist() == [[0.0]]
+    pair = Tuple((Box(-1, 1, (1,), np.float32), Discrete(2)))
+    assert part(acts="1", space=pair).action_space == Discrete(2)
 
 
 @pytest.mark.parametrize("space", [BOX, MultiDiscrete([3, 4, 2]), MultiBinary(3), ROBOT])
-def test_the_last_action_is_held_as_it_was(space):
+def test_the_last_action_is_held_as_it_was_and_zero_is_the_nearest_to_zero(space):
     names = tuple(space) if space is ROBOT else slice(None)
     held = part(acts=names, rest="hold", space=space).part
     batch = gym.vector.utils.batch_space(space, 3)
     batch.seed(0)
     actions = pack(space, batch.sample())
     assert held.filled(3, actions).tobytes() == actions.tobytes()
-
-
-def test_zero_is_the_nearest_to_zero():
     low, high = np.array([1.0, -3.0], np.float32), np.array([2.0, -1.0], np.float32)
-    space = Box(low, high)
-    assert rest_of("zero", space)[0].tolist() == [[1.0, -1.0]]
+    assert rest_of("zero", Box(low, high))[0].tolist() == [[1.0, -1.0]]  # the nearest
     assert rest_of("zero", MultiDiscrete([3], start=[4]))[0].tolist() == [[4]]
 
 
@@ -253,11 +245,6 @@ def test_a_function_that_gives_no_number_is_an_error():
     obs["hook"][1] = 0.0
     with pytest.raises(SkillError, match=r"skill 'x': sees gives .*inf.*finite numbers"):
         own.part.see(obs)
-
-
-def test_tuples_of_actions_have_names():
-    space = Tuple((Box(-1, 1, (1,), np.float32), Discrete(2)))
-    assert part(acts="1", space=space).action_space == Discrete(2)
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from crane import SMALL, Arm, Crane, acted, crane, goes_on_and_loads, greedy
+from crane import SMALL, Crane, acted, crane, goes_on_and_loads, greedy
 from small_runs import reports_every
 from torch import nn
 
 import skillweave as sw
-from skillweave.errors import DeclarationError
-from skillweave.evolution import Evolution
 
 often = reports_every(40)
 OFTEN = sw.TrainDefaults(checkpoint_every=60)
@@ -108,17 +106,12 @@ def test_the_ready_policy_of_a_run_is_kept(tmp_path):
     assert crane([copy.copy(other)]).load_weights(file).evaluate(3).returns == returns
 
 
-@pytest.mark.parametrize(
-    ("policy", "says"),
-    [
-        (sw.Residual(middle, 0.25), "was trained with residual 0.5, but now it is 0.25"),
-        (None, "was trained with residual 0.5, but now it is None"),
-    ],
-)
-def test_another_correction_is_not_loaded(policy, says, tmp_path):
-    run = crane([declared(middle)]).train(tmp_path / "run", quiet=True)
-    with pytest.raises(sw.SkillweaveError, match=says):
-        crane([type("Better", (Better,), {"policy": policy})()]).load(run.path)
+def test_another_correction_is_not_loaded(tmp_path):
+    run = crane([declared(middle)], steps=130).train(tmp_path / "run", quiet=True)
+    for policy, says in ((sw.Residual(middle, 0.25), "0.25"), (None, "None")):
+        other = crane([type("Better", (Better,), {"policy": policy})()])
+        with pytest.raises(sw.SkillweaveError, match=f"with residual 0.5, but now it is {says}"):
+            other.load(run.path)
 
 
 @pytest.mark.slow
@@ -143,21 +136,6 @@ def two(obs: Any) -> Any:
 
 def one(obs: Any) -> Any:
     return np.full((len(obs), 1), -0.5, np.float32)
-
-
-@pytest.mark.slow
-def test_a_population_learns_corrections():
-    evolve = {"better": Evolution(population=2, generations=2)}
-    run = crane([Better()], learn="apart", steps=1200).train(evolve=evolve, quiet=True)
-    assert run.evaluate(2).returns
-
-
-def test_what_has_a_policy_is_not_one():
-    ready = crane([Arm()], steps=130).train(quiet=True)
-    with pytest.raises(DeclarationError, match=r"has a policy, but is none.*\.policy"):
-        crane([declared(ready)]).train(quiet=True)
-    with pytest.raises(DeclarationError, match=r"the skill 'ready', and no policy.*\.policy"):
-        declared(ready.as_skill("ready"))
 
 
 def test_an_action_without_bounds_is_corrected_in_its_own_unit():

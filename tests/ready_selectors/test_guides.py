@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from declaring import plainly
 from ready_selectors import chain
-from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, got_key, has_key
+from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Leave, Wait, got_key, has_key
 from small_runs import OFF, ON, SMALL, Whole, lines, reports_every
 
 from skillweave import (
@@ -57,24 +57,6 @@ class Open(Skill):
 
     def success(self, step):
         return step.next_obs[:, DOOR] == 1
-
-
-class Leave(Skill):
-    """Is ready: a step to the right."""
-
-    max_steps = 1
-
-    def policy(self, obs):
-        return np.full(len(obs), 2)
-
-
-class Wait(Skill):
-    """Is ready: nothing."""
-
-    max_steps = 2
-
-    def policy(self, obs):
-        return np.ones(len(obs), int)
 
 
 AUTOMATON = Automaton(
@@ -239,7 +221,7 @@ def test_a_population_of_restricted_selectors_evolves(tmp_path):
     skills = [
         Leave(),
         Wait(),
-        type("Back", (Wait,), {"policy": lambda s, obs: np.zeros(len(obs), int)})(),
+        type("Back", (Wait,), {"policy": chain.always(0)})(),
     ]
     for skill in skills:
         skill.max_steps = 2
@@ -273,7 +255,7 @@ def test_a_wrong_declaration_is_told(says):
         declare(**WRONG[says])
 
 
-def test_a_guide_that_fails_is_told_before_anything_is_trained(tmp_path):
+def test_a_guide_that_fails_is_told_and_before_anything_is_trained_if_it_always_does(tmp_path):
     def wrong(obs):
         return np.full(len(obs), 9)
 
@@ -281,6 +263,9 @@ def test_a_guide_that_fails_is_told_before_anything_is_trained(tmp_path):
     with pytest.raises(SkillError, match=r"guide: function wrong\(\) returned 9"):
         hierarchy.train(tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
+    stuck = Automaton({"search": "open", "x": "wait"}, {})
+    with pytest.raises(SkillError, match=r"'search' none of its skills \(open\) may start"):
+        declare(guide=stuck, learn="together").train(tmp_path / "run", quiet=True)
 
 
 def test_a_run_with_another_guide_is_refused(whole, tmp_path):
@@ -298,9 +283,3 @@ def test_a_run_with_another_guide_is_refused(whole, tmp_path):
     plain = declare().train(tmp_path / "plain", quiet=True)
     with pytest.raises(RunError, match="has no guide, but the selector of this hierarchy has a"):
         declare(guide=AUTOMATON).load(plain.path)
-
-
-def test_no_skill_of_a_state_may_start(tmp_path):
-    stuck = Automaton({"search": "open", "x": "wait"}, {})
-    with pytest.raises(SkillError, match=r"'search' none of its skills \(open\) may start"):
-        declare(guide=stuck, learn="together").train(tmp_path / "run", quiet=True)

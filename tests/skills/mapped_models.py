@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
+from toys import World
 
 import skillweave as sw
 from skillweave.skills.foreign_policy import fitted
@@ -188,18 +189,11 @@ def script_case(folder: Path) -> Case:
 
 
 def sb3_case(folder: Path) -> Case:
-    import gymnasium as gym
     import stable_baselines3 as sb3
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-    class Small(gym.Env[Any, Any]):
-        observation_space = Box(-10, 10, (4,), np.float32)
-        action_space = Box(-1, 1, (5,), np.float32)
-
-        def reset(self, *, seed=None, options=None):
-            return np.zeros(4, np.float32), {}
-
-    env = VecNormalize(DummyVecEnv([Small]), clip_obs=1.5)
+    spaces = Box(-10, 10, (4,), np.float32), Box(-1, 1, (5,), np.float32)
+    env = VecNormalize(DummyVecEnv([lambda: World(*spaces)]), clip_obs=1.5)
     model = sb3.PPO("MlpPolicy", env, seed=0, device="cpu", policy_kwargs={"log_std_init": 0})
     env.obs_rms.mean, env.obs_rms.var = np.array([1.0, -2.0, 0.5, 0.1]), np.array([4, 0.1, 1, 2.0])
     model.save(folder / "reach.zip")

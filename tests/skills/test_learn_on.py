@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+import toys
 from small_runs import interrupted
 
 import skillweave as sw
@@ -14,26 +15,13 @@ from skillweave.errors import DeclarationError, PolicyError, RunError
 sb3 = pytest.importorskip("stable_baselines3")
 
 
-class World(gym.Env):
-    """Ten steps of noise; pays the first number of the action, or 1 for action 1."""
+SEEN = gym.spaces.Box(-2, 2, (3,), np.float32)
+PUSH = gym.spaces.Box(np.float32([-1.0, 2.0]), np.float32([3.0, 2.5]))
 
-    def __init__(self, observation=None, action=None):
-        self.observation_space = observation or gym.spaces.Box(-2, 2, (3,), np.float32)
-        self.action_space = action or gym.spaces.Box(
-            np.array([-1.0, 2.0], np.float32), np.array([3.0, 2.5], np.float32)
-        )
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        if seed is not None:
-            self.observation_space.seed(seed)
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        self.t += 1
-        reward = float(np.ravel(action)[0])
-        return self.observation_space.sample(), reward, False, self.t >= 10, {}
+def world(observation=SEEN, action=PUSH):
+    """An environment of noise."""
+    return toys.World(observation, action)
 
 
 DISCRETE = gym.spaces.Discrete(3)
@@ -68,7 +56,7 @@ def agent_of(learnable, config, env):
 
 @pytest.mark.parametrize("kind", LEARNS_BY)
 def test_it_acts_as_the_model_does(kind):
-    env = World(action=DISCRETE if kind in ("DQN", "A2C") else None)
+    env = world(action=DISCRETE if kind in ("DQN", "A2C") else PUSH)
     model = model_of(kind, env)
     if kind == "A2C":
         model.policy.action_net.weight.data.mul_(100)  # fresh logits are nearly equal
@@ -93,7 +81,7 @@ def test_it_acts_as_the_model_does(kind):
     ids=str,
 )
 def test_observations_of_other_kinds(space):
-    env = World(space, gym.spaces.MultiDiscrete([3, 4]))
+    env = world(space, gym.spaces.MultiDiscrete([3, 4]))
     model = model_of("PPO", env)
     model.policy.action_net.weight.data.mul_(100)  # fresh logits are nearly equal
     space.seed(0)
@@ -107,7 +95,7 @@ def test_observations_of_other_kinds(space):
 
 
 def test_the_deviation_of_actions_and_the_values_come_along():
-    env = World()
+    env = world()
     model = model_of("PPO", env)
     agent = agent_of(sw.from_sb3(model, learn=True), SMALL["PPO"], env)
     # The first action spans 4, the second 0.5: in [-1, 1] a deviation is half the span as large.
@@ -125,13 +113,13 @@ def test_the_deviation_of_actions_and_the_values_come_along():
 def test_statistics_of_observations_come_along(given):
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-    vec = VecNormalize(DummyVecEnv([World]))
+    vec = VecNormalize(DummyVecEnv([world]))
     vec.reset()
     for _ in range(20):
         vec.step([vec.action_space.sample()])
     model = model_of("PPO", vec)
     learnable = sw.from_sb3(model, normalize=vec if given else None, learn=True)
-    agent = agent_of(learnable, SMALL["PPO"], World())
+    agent = agent_of(learnable, SMALL["PPO"], world())
     obs = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     theirs = model.predict(vec.normalize_obs(obs), deterministic=True)[0]
     np.testing.assert_allclose(agent.act({}, obs)[0], theirs, atol=1e-5)
@@ -147,7 +135,7 @@ def test_a_sequential_module():
         torch.nn.Sequential(torch.nn.Linear(8, 4), torch.nn.ReLU()),
         torch.nn.Linear(4, 2, bias=False),
     )
-    env = World()
+    env = world()
     agent = agent_of(sw.from_torch(module, learn=True), SMALL["PPO"], env)
     obs = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     with torch.no_grad():
@@ -162,11 +150,11 @@ def skill(policy, **fields):
 
 def hierarchy(walk, **settings):
     given = {"algorithm": SMALL["PPO"], "selector": SMALL["PPO"], "steps": 64, "call_steps": 4}
-    return sw.Hierarchy(sw.EnvSpec(World, workers=1), [walk], **(given | settings))
+    return sw.Hierarchy(sw.EnvSpec(world, workers=1), [walk], **(given | settings))
 
 
 def test_a_skill_begins_with_it_and_learns(tmp_path):
-    model = model_of("PPO", World())
+    model = model_of("PPO", world())
     walk = skill(sw.from_sb3(model, learn=True), steps=32)
     run = hierarchy(walk, learn="apart").train(tmp_path / "run", quiet=True)
     entry = run.info()["stages"][0]
@@ -185,10 +173,10 @@ def test_a_skill_begins_with_it_and_learns(tmp_path):
 
 @pytest.mark.parametrize("kind", ["SAC", "DQN"])
 def test_off_policy_skills_act_with_it_from_the_start(kind, tmp_path):
-    env = World(action=DISCRETE if kind == "DQN" else None)
+    env = world(action=DISCRETE if kind == "DQN" else PUSH)
     walk = skill(sw.from_sb3(model_of(kind, env), learn=True), algorithm=SMALL[kind], steps=32)
     made = sw.Hierarchy(
-        sw.EnvSpec(lambda: World(action=env.action_space), workers=1),
+        sw.EnvSpec(lambda: world(action=env.action_space), workers=1),
         [walk],
         selector=SMALL["PPO"],
         steps=64,
@@ -201,7 +189,7 @@ def test_off_policy_skills_act_with_it_from_the_start(kind, tmp_path):
 
 def test_resumed_it_ends_with_the_same_weights(tmp_path):
     def declared():
-        walk = skill(sw.from_sb3(model_of("PPO", World()), learn=True), steps=64)
+        walk = skill(sw.from_sb3(model_of("PPO", world()), learn=True), steps=64)
         return hierarchy(walk, learn="apart", steps=96)
 
     whole = declared().train(tmp_path / "whole", quiet=True)
@@ -215,21 +203,21 @@ def test_resumed_it_ends_with_the_same_weights(tmp_path):
 
 
 def test_a_plain_agent_starts_from_it(tmp_path):
-    model = model_of("PPO", World())
+    model = model_of("PPO", world())
     learnable = sw.from_sb3(model, learn=True)
     config = learnable.learning_on(SMALL["PPO"], "agent")
-    run = sw.Agent(World, config, 16).train(tmp_path / "run", start_from=learnable, quiet=True)
+    run = sw.Agent(world, config, 16).train(tmp_path / "run", start_from=learnable, quiet=True)
     assert "agent" in run.info()["stages"][0]["starts"]
     with pytest.raises(DeclarationError, match=r"write PPO\(.*normalize_obs=False"):
-        sw.Agent(World, SMALL["PPO"], 16).train(
+        sw.Agent(world, SMALL["PPO"], 16).train(
             tmp_path / "other", start_from=learnable, quiet=True
         )
 
 
 def test_other_goals_are_refused(tmp_path):
-    reach, place = gym.spaces.Box(-1, 1, (1,), np.float32), World().observation_space
+    reach, place = gym.spaces.Box(-1, 1, (1,), np.float32), world().observation_space
     seen = gym.spaces.Dict([("observation", place), ("goal", reach)])
-    model = sb3.PPO("MultiInputPolicy", World(seen), device="cpu")
+    model = sb3.PPO("MultiInputPolicy", world(seen), device="cpu")
     module = torch.nn.Sequential(torch.nn.Linear(4, 2))
     for policy in (
         sw.from_sb3(model, learn=True),
@@ -272,7 +260,7 @@ FIVE, PIXELS = (
 )
 REFUSED = [
     (lambda: learning(by_sb3("SAC")), "SAC learns on by SAC"),
-    (lambda: learning(by_sb3("PPO", World(FIVE))), "'walk'.*observation_space"),
+    (lambda: learning(by_sb3("PPO", world(FIVE))), "'walk'.*observation_space"),
     (lambda: learning(by_torch(torch.nn.Linear(5, 2))), "does not fit 'walk'"),
     (lambda: learning(by_torch(torch.nn.Sequential(torch.nn.Linear(5, 2)))), "actor 5 to 2"),
     (lambda: by_torch(of(torch.nn.Dropout(), torch.nn.Linear(4, 2))), "cannot learn on"),
@@ -283,11 +271,11 @@ REFUSED = [
     (lambda: by_torch(torch.nn.Linear(3, 2), every=2), "leave out sees"),
     (
         lambda: sw.from_sb3(
-            sb3.PPO("CnnPolicy", World(PIXELS, DISCRETE), device="cpu"), learn=True
+            sb3.PPO("CnnPolicy", world(PIXELS, DISCRETE), device="cpu"), learn=True
         ),
         "cannot learn on.*NatureCNN",
     ),
-    (lambda: sw.from_sb3(model_of("PPO", World(), use_sde=True), learn=True), "gSDE"),
+    (lambda: sw.from_sb3(model_of("PPO", world(), use_sde=True), learn=True), "gSDE"),
     (lambda: by_torch(with_nan()), "NaN"),
     (lambda: by_sb3("PPO", learn="yes"), "learn is 'yes'"),
     (lambda: by_torch(torch.nn.Linear(3, 2), learn=1), "learn is 1"),
@@ -295,7 +283,7 @@ REFUSED = [
 
 
 def by_sb3(kind, env=None, **how):
-    return sw.from_sb3(model_of(kind, env or World()), **{"learn": True} | how)
+    return sw.from_sb3(model_of(kind, env or world()), **{"learn": True} | how)
 
 
 def by_torch(module, **how):
@@ -309,7 +297,7 @@ def test_what_cannot_learn_on_is_refused(make, says):
 
 
 def test_a_zip_without_trust_repeats_what_was_asked(tmp_path):
-    model_of("PPO", World()).save(tmp_path / "m.zip")
+    model_of("PPO", world()).save(tmp_path / "m.zip")
     with pytest.raises(PolicyError, match=r"ppo.*trust=True, learn=True"):
         sw.from_sb3(tmp_path / "m.zip", learn=True)
     with pytest.raises(RunError, match="does not exist"):

@@ -1,4 +1,4 @@
-"""Mapped policies as data: they refuse what contradicts itself, and act the same in any rows."""
+"""Mapped policies as data: they refuse what contradicts itself."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from skills.mapped_models import onnx_model, weights
 
 from skillweave.policies.acting_errors import PolicyError
-from skillweave.policies.core import Memory, Turn, World
+from skillweave.policies.core import Turn, World
 from skillweave.policies.mapped import (
     Affine,
     Function,
@@ -139,59 +139,3 @@ def test_an_onnx_file_that_its_fields_do_not_fit_is_refused(content):
     obs, state, turn = np.ones((2, 3), np.float32), (np.ones((2, 2), np.float32),), Turn(World())
     found, other = (x.call({"": obs}, state, turn) for x in (file, again))
     np.testing.assert_array_equal(found[0], other[0])
-
-
-# Rows -------------------------------------------------------------------------------------------
-
-
-def recurrent(chunk: int | None) -> Mapped:
-    """A policy with all that can be remembered; its state has the environments last."""
-
-    def model(x: Array, state: Array) -> tuple[Array, Array]:
-        after = np.tanh(0.5 * state + x[:, :2].T + 0.1 * x[:, 3:].sum(axis=1))
-        outputs = np.stack([after.T * (i + 1) for i in range(chunk or 1)], axis=1)
-        return (outputs if chunk else outputs[:, 0]), after
-
-    takes = SEEN, Take("last_action", (2,)), Take("goal", (2,), low=np.array(-0.5))
-    inputs = {"": Input(takes, (7,), (Affine(np.full(7, 0.1), np.full(7, 0.5)),))}
-    outputs = Outputs(box(3), (2, 0), np.full(2, 0.5), clip=(-0.75, 0.75), rest=np.full(3, 0.25))
-    function = Function(model, ((2, None),), single_state=True)
-    return Mapped(function, outputs, inputs, 2, chunk, np.array([0.25, -1.0]), box(2))
-
-
-@pytest.mark.parametrize("chunk", [None, 3])
-@pytest.mark.parametrize("aims", [False, True])
-def test_some_rows_act_as_each_does_alone(chunk, aims):
-    rng, n, policy = np.random.default_rng(0), 5, recurrent(chunk)
-    together, alone = policy.start(n), [policy.start(1) for _ in range(n)]
-    assert set(together) == {"state.0", "last", "phase", "held"}
-    actions = set()
-    for _ in range(40):
-        rows = np.flatnonzero(rng.random(n) < 0.6)
-        obs = rng.normal(size=(len(rows), 3)).astype(np.float32)
-        goal = rng.uniform(-1, 1, (len(rows), 2)).astype(np.float32) if aims else None
-        acted = policy.act(together, rows, obs, Turn(World(), None, goal))
-        for k, i in enumerate(rows):
-            own = None if goal is None else goal[k : k + 1]
-            one = policy.act(alone[i], np.zeros(1, int), obs[k : k + 1], Turn(World(), None, own))
-            np.testing.assert_array_equal(acted[k], one[0])
-        _same(together, alone)
-        actions |= set(acted.reshape(-1).tolist())
-    assert len(actions) > 20
-
-
-def _same(together: Memory, alone: list[Memory]):
-    for name, values in together.items():
-        np.testing.assert_array_equal(values, np.concatenate([one[name] for one in alone]))
-
-
-def test_records_are_held_as_records():
-    def both(obs: Array) -> dict[str, Array]:
-        return {"a": obs[:, :2], "b": (obs[:, 2] > 0).astype(int)}
-
-    policy = Mapped(Function(both), Outputs(BOTH), every=2)
-    memory, rows, turn = policy.start(2), np.arange(2), Turn(World())
-    first = policy.act(memory, rows, np.array([[0.5, 1, 1], [0, 0, -1.0]]), turn)
-    assert memory["held"].dtype == BOTH.record
-    assert policy.act(memory, rows, np.zeros((2, 3)), turn).tobytes() == first.tobytes()
-    assert first["b"].tolist() == [1, 0]
