@@ -209,7 +209,7 @@ def test_where_environments_begin_anew_trajectories_and_returns_end():
     found.run(4 * 2)  # in each environment the steps 0 and 1
     found.learner.cut(np.array([1, 3]))
     assert found.learner.counts()["returns"].tolist() == [1.5, 0.0, 1.5, 0.0]
-    found.collectors.parts[0]._begin_anew(np.array([1, 3]))
+    found.collectors.parts[0]._reset(np.array([1, 3]))
     found.run(4 * 4, at=LoopState(2, 8))
     drawn = found.learner.store.sample(500, found.state.gamma, [np.random.default_rng(0)])
     after = {(int(o), int(n)) for o, n in zip(drawn.obs[0], drawn.next_obs[0], strict=True)}
