@@ -290,6 +290,24 @@ def test_a_planner_that_guides_remembers_the_calls_that_were_made():
     assert choice.tolist() == [0], "what failed was not the plan's choice"
 
 
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_planner_that_guides_knows_the_length_that_another_chose_by_its_end(steps):
+    calls = [(p, [(2, [p + 1], True, "limit")]) for p in range(9)]
+    calls += [(p, [(0, [p - 1], True, "limit")]) for p in range(1, 9)]
+    log = log_of(["left", "right"], calls, lengths=(1, 3))
+    planner = Planner(log, Mission(lambda obs: obs[:, 0] == 0), neighbors=1, gamma=0.9)
+    planner = planner.among(log.skills)
+    obs = np.float32([[2]])
+    choice, memory = planner.act(planner.start(1), obs)
+    assert choice.tolist() == [0]  # left, one step
+    for step in range(1, steps + 1):
+        why = CallEnd.LIMIT if step == steps else CallEnd.RUNNING
+        last = LastCall(np.array([1]), np.full(1, why, np.int8), np.zeros(1, bool))
+        memory = watched(planner, memory, step_to(obs, obs), last)
+    skill, length = divmod(int(memory["tried.choice"][0, 0]), 2)
+    assert (log.skills[skill], log.lengths[length]) == ("right", steps)
+
+
 @pytest.mark.slow
 def test_goals_that_observations_hold_are_learnt():
     """A selector that starts from a plan starts with many goals."""
