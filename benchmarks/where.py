@@ -33,6 +33,7 @@ from skillweave.algorithms.actor_critic import ActorCriticAlgorithm
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.dqn import DQNAlgorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
+from skillweave.algorithms.rollouts import minibatches
 from skillweave.buffers.replay import ReplayStore
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.envs.engine import GymnasiumEngine, WatchedEngine
@@ -145,7 +146,7 @@ def watched(clock: Clock, skip: int) -> Iterator[Window]:
         window.last = loop.at.steps
         window.spent = {key: list(spent) for key, spent in clock.spent.copy().items()}
 
-    real = ppo.minibatches
+    real = minibatches
 
     def timed_minibatches(*args: Any) -> Iterator[Any]:
         drawn = real(*args)
@@ -176,7 +177,7 @@ def measure(train: Callable[[int], Any], steps: int) -> dict[str, Any]:
         train(steps)
     assert window.first is not None, "the training was too short"
     counted = window.last - window.first
-    rows = [
+    rows: list[dict[str, Any]] = [
         {
             "thread": thread,
             "part": part,
