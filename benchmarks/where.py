@@ -26,11 +26,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 from unittest import mock
 
-from benchmarks.common import machine, report, table, warm_up
+from benchmarks.common import report, table, warm_up
 from skillweave import PPO, SAC, EnvSpec, recipes, train_agent
-from skillweave.algorithms import ppo
+from skillweave.algorithms import actor_critic, base, ppo, sac as sac_algorithm
 from skillweave.algorithms.actor_critic import ActorCriticAlgorithm
-from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.dqn import DQNAlgorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.algorithms.rollouts import minibatches
@@ -66,18 +65,23 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "gather: rollout": [(RolloutStore, "rollout")],
     "gather: samples of replay": [(ReplayStore, "sample")],
     "gather: advantages": [(PPOAlgorithm, "samples")],
-    "forward": [
+    "forward, targets": [
         (PPOAlgorithm, "loss"),
         (ActorCriticAlgorithm, "learn"),
         (DQNAlgorithm, "learn"),
     ],
     "backward": [(Layout, "gradient")],
-    "optimiser": [(Algorithm, "step_")],
+    "optimiser": [
+        (base, "adam_"),
+        (base, "clip_grad_norm_"),
+        (actor_critic, "adam_"),
+        (actor_critic, "clip_grad_norm_"),
+        (sac_algorithm, "adam_"),
+    ],
     "the rest of an update": [(RolloutLearner, "learn"), (ReplayLearner, "learn")],
     "waiting for the learner": [(Loop, "_finish_update")],
-    "the rest of a round": [(Loop, "_round")],
 }
-"""By part, the methods that it consists of."""
+"""By part, the methods and functions of classes and modules that it consists of."""
 
 
 class Clock:
@@ -116,7 +120,7 @@ class Clock:
 
 @dataclass
 class Window:
-    """What is counted: from the end of a round to the end of another."""
+    """The rounds that are counted, and the time that their parts took."""
 
     began: float = 0.0
     """By the clock, in seconds."""
@@ -146,10 +150,8 @@ def watched(clock: Clock, skip: int) -> Iterator[Window]:
         window.last = loop.at.steps
         window.spent = {key: list(spent) for key, spent in clock.spent.copy().items()}
 
-    real = minibatches
-
     def timed_minibatches(*args: Any) -> Iterator[Any]:
-        drawn = real(*args)
+        drawn = minibatches(*args)
         while True:
             with clock.part("gather: minibatches"):
                 batch = next(drawn, None)
@@ -215,7 +217,7 @@ CASES: dict[str, tuple[Callable[[int], None], int]] = {
     "sac": (sac, 8),
     "processes": (processes, 1),
 }
-"""By name, what trains, and the part of the steps that it makes."""
+"""By name, a training, and the number by which its steps are divided: slow ones make fewer."""
 
 
 def main() -> None:
@@ -226,10 +228,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200_000)
     given = parser.parse_args()
     warm_up()
-    summary: dict[str, Any] = {"machine": machine()}
+    summary: dict[str, Any] = {}
     for name in given.cases:
-        train, part = CASES[name]
-        summary[name] = found = measure(train, given.steps // part)
+        train, divisor = CASES[name]
+        summary[name] = found = measure(train, given.steps // divisor)
         print(f"\n{name}: {found['steps_per_second']:,} steps a second")
         rows = found["rows"]
         print(table(list(rows[0]), [list(row.values()) for row in rows]), flush=True)

@@ -36,7 +36,7 @@ def test_the_parts_of_a_training_make_up_its_time(algorithm):
     found = where.measure(train, 512)
     rows = found["rows"]
     learning = {row["part"] for row in rows if (row["thread"] == "learner") == algorithm.overlap}
-    assert {"forward", "backward", "optimiser"} <= learning
+    assert {"forward, targets", "backward", "optimiser"} <= learning
     assert {"environments", "acting: network"} <= {row["part"] for row in rows}
     whole = 1e6 / found["steps_per_second"]
     collecting = sum(row["clock"] for row in rows if row["thread"] != "learner")
