@@ -67,7 +67,7 @@ def assert_close(state, other, **how: float):
 @pytest.mark.parametrize(
     ("kind", "space", "backend"),
     [
-        (DQN.rainbow, CHOICES, "aot_eager"),
+        pytest.param(DQN.rainbow, CHOICES, "inductor", marks=needs_compiler),
         (TD3, FORCE, "aot_eager"),
         (SAC, FORCE, "aot_eager"),
     ],

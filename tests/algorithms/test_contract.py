@@ -76,6 +76,7 @@ SEEING = {
     "network": Network((32,), "relu", cnn=CNN("plain", (4,), (3,), (3,))),
 }  # fmt: skip
 SEEING_TWIN = TD3(**SEEING | {"learning_rate": 3e-3})
+SEEING_DDPG = TD3.ddpg(**SEEING)
 SOFT = SAC(**BUFFERED, ent_coef=0.1)
 
 
@@ -114,6 +115,7 @@ TABLE = {
         ("ppo", ON, "discrete", "MultiDiscrete", 1024),
         ("ppo", ON, "multi-discrete", "MultiBinary", 1024),
         ("ppo", ON, "dict", "Box", 2560),
+        ("ppo", ON, "image, channels last", "Discrete", 1024),
         ("ppo", ON, "image, channels first", "MultiDiscrete", 1024),
         ("ppo squashed", SQUASHED, "multi-binary", "Box", 4096),
         ("ppo with state's deviation", STATE_STD, "tuple", "Box", 4096),
@@ -121,19 +123,35 @@ TABLE = {
         ("ppo with gru", replace(GRU, ent_coef=0.02), "dict", "MultiBinary", 6144),
         ("self-imitation", IMITATING, "vector", "Discrete", 1024),
         ("self-imitation", IMITATING, "dict", "Box", 2560),
+        ("self-imitation", IMITATING, "image, channels last", "MultiDiscrete", 1024),
         ("own", OWN, "vector", "Discrete", 7680),
         ("own", replace(OWN, learning_rate=5e-3), "tuple", "Box", 25_600),
+        ("own", OWN, "image, channels last", "Discrete", 7680),
         ("dqn", Q, "vector", "Discrete", 320),
+        ("dqn", Q, "multi-discrete", "Discrete", 320),
         ("dqn", Q, "image, channels first", "Discrete", 320),
+        ("dqn", Q, "tuple", "Discrete", 320),
         ("rainbow", RAINBOW, "vector", "Discrete", 400),
+        ("rainbow", RAINBOW, "discrete", "Discrete", 400),
+        ("rainbow", RAINBOW, "multi-binary", "Discrete", 400),
         ("rainbow", RAINBOW, "image, channels last", "Discrete", 400),
+        ("rainbow", RAINBOW, "dict", "Discrete", 400),
         ("td3", TWIN, "vector", "Box", 700),
+        ("td3", TWIN, "discrete", "Box", 700),
+        ("td3", TWIN, "multi-binary", "Box", 700),
+        ("td3", SEEING_TWIN, "image, channels last", "Box", 1100),
         ("td3", SEEING_TWIN, "dict", "Box", 1100),
         ("ddpg", DDPG, "multi-discrete", "Box", 700),
+        ("ddpg", SEEING_DDPG, "image, channels first", "Box", 1600),
+        ("ddpg", DDPG, "tuple", "Box", 700),
         ("sac", SOFT, "vector", "Box", 600),
+        ("sac", SOFT, "multi-discrete", "Box", 400),
+        ("sac", SOFT, "image, channels last", "Box", 450),
         ("sac", SOFT, "dict", "Box", 450),
         ("sac", SOFT, "discrete", "Discrete", 400),
+        ("sac", SOFT, "multi-binary", "Discrete", 400),
         ("sac", SOFT, "image, channels first", "Discrete", 400),
+        ("sac", SOFT, "tuple", "Discrete", 400),
     ]
 }
 FIRST = {name.split(",")[0]: name for name in reversed(TABLE)}.values()
@@ -148,11 +166,9 @@ every_case = pytest.mark.parametrize(
 
 
 @pytest.mark.parametrize("kind", [PPO, DQN, TD3, SAC])
-def test_the_table_has_every_observation_and_images_and_all_actions_of_each_algorithm(kind):
-    assert {case.shows for case in TABLE.values()} == set(SHOWS)
+def test_the_table_has_every_observation_for_every_algorithm(kind):
     cases = [case for case in TABLE.values() if isinstance(case.config, kind)]
-    assert {"vector"} < {case.shows for case in cases}
-    assert any(case.shows == "dict" or "image" in case.shows for case in cases)
+    assert {case.shows for case in cases} == set(SHOWS)
     acts = {
         PPO: {"Discrete", "MultiDiscrete", "MultiBinary", "Box"},
         DQN: {"Discrete"}, TD3: {"Box"}, SAC: {"Box", "Discrete"},
@@ -265,22 +281,32 @@ EXACT = {
 COLD = {"ent_coef": 1e-4, "learn_ent_coef": False}
 VALUED = {
     "ppo": replace(ON, gamma=GAMMA),
+    "self-imitation": replace(IMITATING, gamma=GAMMA),
     "own": replace(OWN, gamma=GAMMA),
     "ppo with lstm": replace(LSTM, gamma=GAMMA),
     "dqn": DQN(**EXACT),
     "dqn of three steps": DQN(**EXACT, n_step=3),
     "rainbow": DQN.rainbow(**EXACT, v_min=0.0, v_max=6.0, n_atoms=25),
+    "td3": TD3(**EXACT),
+    "ddpg": TD3.ddpg(**EXACT),
     "sac of choices": SAC(**EXACT, **COLD),
+    "sac of forces": SAC(**EXACT, **COLD),
 }
-WORTH = ["ppo", "own", "dqn of three steps"]
-"""Of each store one; the targets of all algorithms are tested by hand beside them."""
+CHOOSERS = [name for name in VALUED if name not in ("td3", "ddpg", "sac of forces")]
 
 
-def trained(env, name: str, scale: float = 1.0) -> tuple[Any, Any]:
-    """Trained for a number of calls."""
+def acted_in(env, name: str):
+    """The toy, with forces as actions where the algorithm needs them."""
+    if name not in CHOOSERS:
+        env.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    return env
+
+
+def trained(env, name: str, each: int = 1, scale: float = 1.0) -> tuple[Any, Any]:
+    """Trained for a number of calls of so many steps."""
     config = VALUED[name]
-    calls = {PPO: 4096, type(OWN): 16_384}.get(type(config), 900)
-    return learn(config, env, int(calls * scale))
+    calls = {PPO: 4096, SelfImitationPPO: 4096, type(OWN): 16_384}.get(type(config), 900)
+    return learn(config, env, int(calls * each * scale))
 
 
 def values(algorithm, state, obs) -> list[float]:
@@ -289,17 +315,17 @@ def values(algorithm, state, obs) -> list[float]:
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", [*WORTH, "ppo with lstm"])
+@pytest.mark.parametrize("name", [name for name in VALUED if name != "ddpg"])
 def test_a_time_limit_is_bootstrapped(name):
-    algorithm, state = trained(Allowance(8), name)
+    algorithm, state = trained(acted_in(Allowance(8), name), name)
     # Taken for an end, the limit of 5 steps would leave 1 / (1 − 0.8 · 4/5) = 2.8 on average.
     assert values(algorithm, state, np.zeros((1, 1), np.float32)) == pytest.approx([5.0], rel=0.06)
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", WORTH)
+@pytest.mark.parametrize("name", [name for name in VALUED if name != "ppo with lstm"])
 def test_an_end_is_not_bootstrapped(name):
-    algorithm, state = trained(Countdown(8), name)
+    algorithm, state = trained(acted_in(Countdown(8), name), name)
     finite = [sum(GAMMA**i for i in range(5 - t)) for t in range(5)]  # 3.4 down to 1, else 5
     assert values(algorithm, state, np.arange(5)) == pytest.approx(finite, rel=0.06)
 
@@ -325,9 +351,9 @@ class LongCalls(Toy):
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", WORTH)
+@pytest.mark.parametrize("name", [name for name in VALUED if name != "ppo with lstm"])
 def test_the_value_of_calls_discounts_by_their_length(name):
-    algorithm, state = trained(LongCalls(8), name)
+    algorithm, state = trained(acted_in(LongCalls(8), name), name)
     expected, wrong = 3 / (1 - GAMMA**10), 3 / (1 - GAMMA)
     found = values(algorithm, state, np.zeros((1, 1), np.float32))
     assert found == pytest.approx([expected], rel=0.06)
@@ -338,27 +364,31 @@ SHORT, LONG = 1 / (1 - GAMMA), 3 + GAMMA**10 / (1 - GAMMA)  # 5.0 and 3.54
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", ["ppo", "dqn", "sac of choices"])
+@pytest.mark.parametrize("name", [name for name in CHOOSERS if name != "ppo with lstm"])
 def test_a_short_call_is_preferred_over_a_long_one_that_pays_more_but_less_a_step(name):
-    algorithm, state = trained(Calls(8), name, scale=4.0 if name == "sac of choices" else 1.5)
+    algorithm, state = trained(
+        Calls(8), name, scale={"sac of choices": 4.0, "rainbow": 2.0}.get(name, 1.5)
+    )
     still = np.zeros((1, 1), np.float32)
     policy = AgentPolicy.of(algorithm, state)
     assert policy.act(policy.start(1), still)[0].tolist() == [0]
     assert values(algorithm, state, still) == pytest.approx([SHORT], rel=0.06)
     # Without γ^τ the long call would be worth 3 / (1 − 0.8) = 15, and be chosen.
     rows = torch.zeros(1, 1, 1)
-    if name in ("dqn", "sac of choices"):
+    if name in ("dqn", "dqn of three steps", "sac of choices"):
         actor = algorithm.acting_params(state)
         if name == "sac of choices":
             inputs = algorithm.inputs(actor, rows)
             q = algorithm.critics(algorithm.critics.views(state.critic), inputs).mean(1)
         else:
             q = algorithm.act(actor, rows, None, None)[1]
-        assert q.flatten().tolist() == pytest.approx([SHORT, LONG], rel=0.06)
+        assert q.flatten().tolist()[0] == pytest.approx(SHORT, rel=0.06)
+        if name != "dqn of three steps":  # off-policy beyond the first step
+            assert q.flatten().tolist()[1] == pytest.approx(LONG, rel=0.06)
 
 
 @pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("name", VALUED)
+@pytest.mark.parametrize("name", CHOOSERS)
 def test_a_forbidden_action_is_never_taken(name):
     env, config = Masked(8), VALUED[name]
     if isinstance(config, DQN) and not config.noisy:
@@ -375,7 +405,7 @@ def test_a_forbidden_action_is_never_taken(name):
         assert (some != obs).all()
 
 
-@pytest.mark.parametrize("name", [name for name in VALUED if isinstance(VALUED[name], OffPolicy)])
+@pytest.mark.parametrize("name", [name for name in CHOOSERS if isinstance(VALUED[name], OffPolicy)])
 def test_a_forbidden_action_is_never_drawn_at_random_before_learning(name):
     env = Masked(8)
     algorithm, _ = learn(replace(VALUED[name], learning_starts=4000), env, 2000)
@@ -531,8 +561,9 @@ RECALLING = {"num_envs": 16, "n_steps": 16, "batch_size": 64, "gamma": 0.9, "ove
 
 
 @pytest.mark.slow
-def test_what_was_seen_three_steps_before_is_remembered():
-    assert remembered(replace(MEMORIES["lstm"], **RECALLING), 10_240) == 1.0
+@pytest.mark.parametrize("kind", MEMORIES)
+def test_what_was_seen_three_steps_before_is_remembered(kind):
+    assert remembered(replace(MEMORIES[kind], **RECALLING), 10_240) == 1.0
 
 
 def test_without_a_memory_it_is_a_guess():
