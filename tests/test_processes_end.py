@@ -24,7 +24,16 @@ def forever():
             pass
 
 def deaf():
-    socket.socketpair()[0].recv(1)
+    ends = socket.socketpair()
+    ends[0].recv(1)
+
+class Careless:
+    def __del__(self):
+        time.sleep(1000)  # what a signal raises here is lost
+
+def careless():
+    Careless()
+    time.sleep(1000)
 
 class Env(gym.Env):
     observation_space = gym.spaces.Box(-20, 20, (1,), np.float32)
@@ -52,7 +61,7 @@ class Env(gym.Env):
             open(f"closed-{os.getpid()}", "w").close()
 
 what = sys.argv[1]
-blocks = {"sleep": lambda: time.sleep(1000), "socket": deaf, "swallows": forever}
+blocks = {"sleep": lambda: time.sleep(1000), "socket": deaf, "swallows": forever, "del": careless}
 long = sw.PPO(num_envs=4, n_steps=8192, batch_size=64, update_epochs=1, network=sw.Network((4,)))
 evolve = Evolution(population=2, generations=1, episodes=2) if what == "part" else None
 if __name__ == "__main__":
@@ -61,7 +70,7 @@ if __name__ == "__main__":
     spec = sw.EnvSpec(Env, engine="sync", workers=2)
     sw.train_agent(spec, long, 100_000, "run", quiet=True, evolve=evolve)
 """
-CLOSES = ("rollout", "sleep", "socket", "part", "spawn")
+CLOSES = ("rollout", "sleep", "socket", "del", "part", "spawn")
 
 
 def numbers(folder: Path, what: str) -> set[int]:

@@ -21,6 +21,8 @@ from skillweave.workers.host import SentError, WorkerHost, error_to_send
 
 GRACE = 5.0
 """Seconds that environments have to close after the parent has ended."""
+AGAIN = 0.5
+"""Seconds until an environment that did not end is told again."""
 LEFT = 0.3
 """Seconds that processes of environments have to end, first by themselves and then by SIGTERM."""
 
@@ -82,9 +84,10 @@ def work(
     other_end.close()
     notices = collect_notices()
     station: WorkerHost | None = None
+    closing = threading.Event()
     try:
         try:
-            _end_with(parent)
+            _end_with(parent, closing)
             _may_have_processes()
             station = WorkerHost(maker.make, each, number)
             _send(channel, None, None, notices)
@@ -96,6 +99,7 @@ def work(
         except BaseException as error:
             _send(channel, error_to_send(error), None, notices)
         finally:
+            closing.set()
             if station is not None:
                 with suppress(Exception, SystemExit):
                     station.collector.close()
@@ -130,18 +134,22 @@ def _end(number: int, frame: FrameType | None) -> NoReturn:
     raise _Ended
 
 
-def _end_with(parent: int | None) -> None:
+def _end_with(parent: int | None, closing: threading.Event) -> None:
     """End this process soon after its parent, also during a rollout.
 
-    Environments get time to close: they may have processes of their own.
+    Environments get time to close: they may have processes of their own. What a signal raises in
+    a ``__del__`` is lost, so the signal is repeated until they close, and then no more.
     """
     main = threading.main_thread().ident
     assert main is not None
 
     def end() -> None:
-        with suppress(OSError, ValueError):
-            signal.pthread_kill(main, signal.SIGTERM)
-        sleep(GRACE)
+        until = monotonic() + GRACE
+        while not closing.is_set() and monotonic() < until:
+            with suppress(OSError, ValueError):
+                signal.pthread_kill(main, signal.SIGTERM)
+            closing.wait(AGAIN)
+        sleep(max(0.0, until - monotonic()))
         kill_group()
 
     when_parent_ends(end, parent)
