@@ -151,7 +151,7 @@ class EnvPoolEngine(WatchedEngine):
             obs, info = pool.reset(ids[part].astype(np.int32))
             return pack(self.observation_space, obs), info
 
-        obs, info = self._in_pools(ids, reset)
+        obs, info = _in_order(self._parts(ids), reset)
         return self._after_reset(obs, info, ids)
 
     def _act(self, action: Array, ids: Array) -> RawStep:
@@ -159,30 +159,47 @@ class EnvPoolEngine(WatchedEngine):
         if self._discrete:
             action = action.astype(np.int32)
 
+        parts = self._parts(ids)
+        for pool, part in parts:
+            if _steps_apart(pool):  # then all have their actions before the first is waited for
+                pool.send(action[part], ids[part].astype(np.int32))
+
         def step(pool: Any, part: Array) -> tuple[Any, ...]:
-            obs, *rest = pool.step(action[part], ids[part].astype(np.int32))
+            if _steps_apart(pool):
+                obs, *rest = pool.recv(reset=False, return_info=True)
+            else:
+                obs, *rest = pool.step(action[part], ids[part].astype(np.int32))
             return pack(self.observation_space, obs), *rest
 
         # An episode that terminates in the step of its time limit arrives as truncated: EnvPool
         # computes `terminated = done & ~truncated`, so the two cannot be distinguished.
-        return self._after_step(RawStep(*self._in_pools(ids, step)), ids)
+        return self._after_step(RawStep(*_in_order(parts, step)), ids)
 
-    def _in_pools(
-        self, ids: Array, call: Callable[[Any, Array], tuple[Any, ...]]
-    ) -> tuple[Any, ...]:
-        """Call ``call`` for each pool with its part of ``ids``; join the results in their order."""
+    def _parts(self, ids: Array) -> list[tuple[Any, Array]]:
+        """Return each pool with some of environments ``ids`` (k,), and their places in ``ids``."""
         if len(self._pools) == 1:
-            return call(self._pools[0], np.arange(len(ids)))
-        parts = [np.flatnonzero(self._place[ids] == k) for k in range(len(self._pools))]
-        answers = [
-            (part, call(pool, part))
-            for pool, part in zip(self._pools, parts, strict=True)
-            if len(part)
-        ]
-        return tuple(
-            _joined([(part, result[i]) for part, result in answers], len(ids))
-            for i in range(len(answers[0][1]))
-        )
+            return [(self._pools[0], np.arange(len(ids)))]
+        places = [np.flatnonzero(self._place[ids] == k) for k in range(len(self._pools))]
+        return [(p, at) for p, at in zip(self._pools, places, strict=True) if len(at)]
+
+
+def _steps_apart(pool: Any) -> bool:
+    """Return whether a pool is EnvPool's own, which takes actions and returns the step later."""
+    return hasattr(type(pool), "send")
+
+
+def _in_order(
+    parts: list[tuple[Any, Array]], call: Callable[[Any, Array], tuple[Any, ...]]
+) -> tuple[Any, ...]:
+    """Call ``call`` for each pool with its places; join the results in the order of places."""
+    if len(parts) == 1:
+        return call(*parts[0])
+    answers = [(part, call(pool, part)) for pool, part in parts]
+    n = sum(len(part) for part, _ in answers)
+    return tuple(
+        _joined([(part, result[i]) for part, result in answers], n)
+        for i in range(len(answers[0][1]))
+    )
 
 
 def _joined(parts: list[tuple[Array, Any]], n: int) -> Any:

@@ -16,7 +16,7 @@ from skillweave.envs.engine import Engine
 from skillweave.envs.env_infos import allowed_rows
 from skillweave.errors import DeclarationError
 from skillweave.policies.core import RUNNING, Array, Turn, World, restart
-from skillweave.policies.floats import usual_floats
+from skillweave.policies.floats import in_usual_floats
 from skillweave.policies.hierarchy import SKILL, unless_none
 from skillweave.policies.parts import GOAL
 from skillweave.policies.spaces import space_of
@@ -67,7 +67,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self._ready = False
         """It has been reset, and not been closed."""
 
-    @usual_floats()
+    @in_usual_floats
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -96,7 +96,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         info = {} if self._mask is None else {"action_mask": self._mask}
         return unpack(self.single_observation_space, self._obs), info
 
-    @usual_floats()
+    @in_usual_floats
     def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Run one call in each environment.
 

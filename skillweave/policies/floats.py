@@ -9,9 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any
+from functools import wraps
+from typing import Any, TypeVar
 
 import numpy as np
+
+C = TypeVar("C", bound=Callable[..., Any])
+DEFAULT = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}
+"""NumPy's own setting."""
 
 _PROGRAM: ContextVar[dict[str, Any] | None] = ContextVar("_PROGRAM", default=None)
 """The program's own ``numpy.seterr``, where the library has replaced it; None: it has not."""
@@ -32,6 +37,19 @@ def usual_floats() -> Iterator[None]:
             yield
     finally:
         _PROGRAM.reset(before)
+
+
+def in_usual_floats(method: C) -> C:
+    """Return a method that runs in ``usual_floats``; usually that costs little."""
+
+    @wraps(method)
+    def call(*args: Any, **named: Any) -> Any:
+        if np.geterr() == DEFAULT:
+            return method(*args, **named)
+        with usual_floats():
+            return method(*args, **named)
+
+    return call  # type: ignore[return-value]
 
 
 def by_program(function: Callable[..., Any], *args: Any, **named: Any) -> Any:

@@ -289,6 +289,13 @@ class Outputs:
                 "arrays, or let its skill write one part alone (acts)"
             )
         box = space.kind == "Box"
+        self._bounds: tuple[Array | None, Array | None] = (None, None)
+        if box:
+            low, high = space.bounds
+            self._bounds = (
+                None if (low == -np.inf).all() else low,
+                None if (high == np.inf).all() else high,
+            )
         size = prod(space.shape) if box else sum(space.counts)
         self.count = size if box else 0
         """The number of outputs that are numbers of an action."""
@@ -400,9 +407,10 @@ class Outputs:
             full = self._rest.repeat(n, axis=0)
             full[:, self._to] = written
         full = full.reshape(n, *space.shape)
-        if np.dtype(space.dtype).kind in "iu":
+        kind = space.record
+        if kind.kind in "iu":
             full = np.rint(full)
-        return clipped(full, *space.bounds).astype(space.dtype), numbers
+        return clipped(full, *self._bounds).astype(kind, copy=False), numbers
 
 
 # Models -----------------------------------------------------------------------------------------
@@ -600,7 +608,7 @@ class OnnxFile(Model):
                 )
 
     def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in vars(self).items() if k not in ("opened", "_given")} | {
+        return {k: v for k, v in vars(self).items() if k not in ("opened", "_given", "_types")} | {
             "session": None
         }
 
@@ -614,6 +622,11 @@ class OnnxFile(Model):
         """Its inputs, those of its state too, as the file has them."""
         named = {*self.inputs, *(name for name, _ in self.state)}
         return {i.name: i for i in self.opened.get_inputs() if i.name in named}
+
+    @cached_property
+    def _types(self) -> dict[str, type[np.generic]]:
+        """The types of its inputs, without those of its state."""
+        return {name: NUMBERS[self._given[name].type] for name in self.inputs}
 
     @cached_property
     def _axes(self) -> tuple[int, ...] | None:
@@ -650,8 +663,7 @@ class OnnxFile(Model):
     ) -> tuple[Any, Sequence[Array]]:
         """Run the model."""
         only = {self.inputs[0]: inputs[""]} if "" in inputs else inputs
-        types = {name: NUMBERS[self._given[name].type] for name in self.inputs}
-        rows = {name: np.ascontiguousarray(only[name], kind) for name, kind in types.items()}
+        rows = {name: np.ascontiguousarray(only[name], kind) for name, kind in self._types.items()}
         n = len(rows[self.inputs[0]])
         axes = self._axes
         if axes is not None:
@@ -659,6 +671,9 @@ class OnnxFile(Model):
                 rows, [np.moveaxis(x, 0, k) for x, k in zip(state, axes, strict=True)]
             )
             return output, [np.moveaxis(x, k, 0) for x, k in zip(after, axes, strict=True)]
+        if n == 1:
+            output, after = self._run(rows, [x[0] for x in state])
+            return output, [x[None] for x in after]
         each = [
             self._run({k: v[i : i + 1] for k, v in rows.items()}, [x[i] for x in state])
             for i in range(n)

@@ -184,6 +184,8 @@ class Space:
         Raises:
             PolicyError: it does not fit.
         """
+        if type(value) is np.ndarray and value.dtype == self.record and value.shape == self.shape:
+            return value
         if self.parts is None:
             try:
                 found = np.asarray(value)
@@ -210,7 +212,8 @@ class Space:
             return numbers
         if isinstance(value, np.ndarray) and value.dtype == self.record:
             return value
-        given = self.by_name(value)
+        named = type(value) is dict and value.keys() >= self.parts.keys()
+        given = value if named else self.by_name(value)
         names = list(self.parts)
         if given is None or (self.kind == "Tuple" and len(given) > len(names)):
             shape = getattr(value, "shape", None)

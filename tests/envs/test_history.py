@@ -100,6 +100,26 @@ def test_old_pools_are_left_one_episode_at_a_time_and_histories_stay_short(monke
     assert longest < 400, "a hundred steps, and the episodes that were open"
 
 
+def test_two_pools_that_step_at_once_show_what_they_do_one_after_the_other(monkeypatch):
+    pytest.importorskip("envpool")
+    monkeypatch.setattr(envpool_engine, "RENEW_AFTER", 100)
+    shown = []
+    for at_once in (True, False):
+        if not at_once:
+            monkeypatch.setattr(envpool_engine, "_steps_apart", lambda pool: False)
+        engine = make_engine(EnvSpec("CartPole-v1", engine="envpool"), N, threads=2)
+        engine.reset(0)
+        parts, pools = [], set()
+        for part in range(20):
+            parts += run(engine, 20, part)
+            pools.add(len(engine._pools))
+        assert pools == {1, 2}
+        shown.append(parts)
+        engine.close()
+    for one, other in zip(*shown, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize("engine", ["envpool", "sync"])
 def test_joined_engines_are_their_parts_side_by_side(engine):
     if engine == "envpool":
