@@ -35,8 +35,6 @@ from skillweave.ops.returns import gae
 from skillweave.policies.core import Array
 from skillweave.spaces import ChoiceSpace
 
-REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
-"""Metrics of a minibatch."""
 REHEARSAL_COST = 0.2
 """Cost of a nat of KL in the rehearsal's observations, where advantages have a deviation of 1."""
 OPENNESS = 0.1
@@ -165,10 +163,8 @@ class PPOAlgorithm(Algorithm):
         rate = terms.rate
         count = samples.count
         limited = self._kl_limit is not None
-        names = REPORT if terms.reference is None else (*REPORT, "reference_kl")
-        names = names if batch.rehearsal is None else (*names, "rehearsal_kl")
-        steps = torch.zeros_like(rate)
-        sums = rate.new_zeros(len(names), len(rate))
+        reports: list[dict[str, Tensor]] = []  # of gradient steps
+        learnt: list[Tensor] = []  # (P,) bool each, the members that took part
         compiles = cfg.compile and not self.memory_size
         # A compiled step makes its leaves itself; others share these.
         leaves = None if compiles else self.layout.leaves(state.params)
@@ -180,12 +176,15 @@ class PPOAlgorithm(Algorithm):
                 size = minibatch.advantage.shape[1]
                 terms.rehearsal = self._drawn(state, batch.rehearsal, size, rng)
             report, learns = learn(state, leaves, minibatch, terms, None if all_learn else active)
-            steps = steps + active
-            sums.addcmul_(torch.stack([report[k] for k in names]), active.float())
+            reports.append(report)
+            learnt.append(active)
             active = active if learns is None else learns
             if limited and all_false(active):
                 break
-        metrics |= dict(zip(names, sums / steps.clamp_min(1.0), strict=True))
+        counted = torch.stack(learnt).to(rate.dtype)
+        steps = counted.sum(0).clamp_min(1.0)
+        for name in reports[0]:
+            metrics[name] = (torch.stack([r[name] for r in reports]) * counted).sum(0) / steps
         if cfg.learning_rate_schedule == "kl":
             target = torch.full_like(rate, cfg.target_kl or 0.0)
             state.learning_rate = kl_adapted_rate(rate, metrics["kl"], target, *_LR_RANGE)
