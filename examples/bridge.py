@@ -134,7 +134,15 @@ class Cross(sw.Skill):
 
 def algorithm(**how: Any) -> sw.PPO:
     """Return the learner's settings."""
-    return sw.PPO(num_envs=16, n_steps=64, gamma=0.97, **how)
+    settings: dict[str, Any] = {
+        "num_envs": 16,
+        "n_steps": 64,
+        "batch_size": 256,
+        "update_epochs": 10,
+        "gamma": 0.97,
+        "learning_rate": 1e-3,
+    }
+    return sw.PPO(**settings | how)
 
 
 def declare(steps: int = 500_000, workers: int | None = None, **how: Any) -> sw.Hierarchy:

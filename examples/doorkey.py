@@ -98,16 +98,18 @@ class Goal(sw.Skill):
 
 def algorithm(kind: type[sw.PPO] = sw.PPO, **how: Any) -> sw.PPO:
     """Return the learner's settings; ``encoder="cells"``: a cell's numbers are kinds of things."""
-    return kind(
-        num_envs=16,
-        n_steps=128,
-        update_epochs=4,
-        gamma=0.99,
-        gae_lambda=0.95,
-        learning_rate_schedule="constant",
-        network=sw.Network(hidden=(64,), encoder="cells"),
-        **how,
-    )
+    settings: dict[str, Any] = {
+        "num_envs": 16,
+        "n_steps": 128,
+        "batch_size": 256,
+        "update_epochs": 4,
+        "gamma": 0.99,
+        "gae_lambda": 0.95,
+        "learning_rate": 1e-3,
+        "learning_rate_schedule": "constant",
+        "network": sw.Network(hidden=(64,), encoder="cells"),
+    }
+    return kind(**settings | how)
 
 
 def declare(
@@ -123,8 +125,8 @@ def declare(
         room: MiniGrid's name of it, without version.
         engine: auto: in EnvPool, where it is installed; sync: in Python.
     """
-    # Here minibatches twice as large as the default, with a rate √2 times as high, are as good and
-    # take less time. Other rooms are taken to be harder: where successes are rare at first, PPO
+    # Here minibatches twice as large, with a rate √2 times as high, are as good and take less time.
+    # Other rooms are taken to be harder: where successes are rare at first, PPO
     # forgets one before the next comes.
     here = room == ROOM
     fast: dict[str, Any] = {"batch_size": 512, "learning_rate": 1.4e-3}

@@ -75,6 +75,8 @@ def main():
         selector=tour,
         call_steps=100,
         algorithm=sw.PPO(
+            num_envs=64,
+            n_steps=64,
             learning_rate=1e-3,
             gamma=0.98,
             gae_lambda=0.95,

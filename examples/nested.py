@@ -108,7 +108,9 @@ def declare(steps: int = 150_000, **how: Any) -> sw.Hierarchy:
     learner = sw.PPO(
         num_envs=16,
         n_steps=128,
+        batch_size=256,
         update_epochs=4,
+        learning_rate=1e-3,
         gamma=0.97,
         gae_lambda=0.98,
         network=sw.Network(hidden=(64, 64)),

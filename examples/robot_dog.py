@@ -176,7 +176,13 @@ def main():
         run = sw.train_agent(env, sw.PPO(gamma=0.998), args.steps, args.out, seed=args.seed)
     else:
         learnt = sw.PPO(  # it sees the point alone
-            num_envs=16, n_steps=640, batch_size=128, gamma=0.998, network=sw.Network(sees=(0, 1))
+            num_envs=16,
+            n_steps=640,
+            batch_size=128,
+            update_epochs=10,
+            learning_rate=1e-3,
+            gamma=0.998,
+            network=sw.Network(sees=(0, 1)),
         )
         hierarchy = sw.Hierarchy(
             env,

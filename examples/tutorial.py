@@ -63,7 +63,15 @@ hierarchy = Hierarchy(
     skills=[Stabilize(), Center(), Landing()],
     call_steps=40,
     reflexes=[Reflex(landed, action=0, name="engines off")],
-    algorithm=PPO(update_epochs=4, learning_rate=1e-3, gamma=0.99, gae_lambda=0.95),
+    algorithm=PPO(
+        num_envs=64,
+        n_steps=64,
+        batch_size=256,
+        update_epochs=4,
+        learning_rate=1e-3,
+        gamma=0.99,
+        gae_lambda=0.95,
+    ),
     apart=Apart(skill_steps=500_000, selector_steps=1_000_000),
 )
 

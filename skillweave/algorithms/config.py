@@ -47,11 +47,11 @@ class OnPolicy:
         DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    num_envs: Amount = 64
+    num_envs: Amount = 128
     """Environments stepped side by side."""
-    n_steps: Amount = 64
+    n_steps: Amount = 32
     """Environment steps of each environment between updates, for selectors too."""
-    learning_rate: LearningRate = 1e-3
+    learning_rate: LearningRate = 2.5e-3
     """Adam's step size, at the start; or ``Linear(start, end)``, or a function of the share of the
     budget that remains, 1 at the start and 0 at the end, as in Stable-Baselines3."""
     gamma: Fraction = 0.995
@@ -80,9 +80,9 @@ class PPO(OnPolicy):
         DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    batch_size: AtLeastOne = 256
+    batch_size: AtLeastOne = 512
     """Approximate samples of a gradient step (a minibatch); a smaller rollout is one minibatch."""
-    update_epochs: Amount = 10
+    update_epochs: Amount = 6
     """Passes over each rollout."""
     learning_rate_schedule: Literal["constant", "linear", "kl"] = "linear"
     """constant; linear: falls to 0 over the budget; kl: follows target_kl. Counts where
@@ -128,8 +128,8 @@ class PPO(OnPolicy):
     """The critic's network; None: as the actor's."""
     compile: bool | Literal["auto"] = False
     """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute;
-    auto: where that is possible. Weights differ in their last bits, also of a run that was stopped
-    and goes on."""
+    a later process waits for a few seconds. auto: where that is possible. Weights differ in their
+    last bits, also of a run that was stopped and goes on."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -269,8 +269,8 @@ class OffPolicy:
     """Torch threads while learning."""
     compile: bool | Literal["auto"] = False
     """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute;
-    auto: where that is possible. Weights differ in their last bits, also of a run that was stopped
-    and goes on."""
+    a later process waits for a few seconds. auto: where that is possible. Weights differ in their
+    last bits, also of a run that was stopped and goes on."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Device of learning; auto: a GPU if available. Acting runs on the CPU."""
 

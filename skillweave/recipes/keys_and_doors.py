@@ -218,6 +218,7 @@ WORKER = PPO(
     network=CELLS,
 )
 SELECTOR = PPO(
+    learning_rate=1e-3,
     min_advantage_std=0.0,  # the figures were measured with it
     num_envs=32,
     n_steps=256,

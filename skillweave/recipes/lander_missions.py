@@ -179,11 +179,20 @@ class Land(Skill):
         return on_pad
 
 
-PILOT = PPO(network=Network(sees=tuple(range(8))))
+PILOT = PPO(
+    num_envs=64,
+    n_steps=64,
+    batch_size=256,
+    update_epochs=10,
+    learning_rate=1e-3,
+    network=Network(sees=tuple(range(8))),
+)
 """The learner of a skill. It does not see the mission: it would learn to fly well on the missions
 that it meets often, and badly on the others."""
 RELU = Network(activation="relu")  # tanh costs more than all the rest of so small a network
 SELECTOR = PPO(
+    num_envs=64,
+    learning_rate=1e-3,
     min_advantage_std=0.0,  # the figures were measured with it
     n_steps=128,
     batch_size=32,  # a rollout has few decisions

@@ -89,6 +89,8 @@ def landed(obs: Array) -> Array:
 RELU = Network(activation="relu")  # tanh costs more than all the rest of so small a network
 
 HOLDING = PPO(
+    num_envs=64,
+    n_steps=64,
     learning_rate=1e-3,
     gamma=0.98,
     gae_lambda=0.95,
@@ -111,7 +113,16 @@ SELECTOR = PPO(
     normalize_obs=False,
     network=RELU,
 )
-FLAT = PPO(gamma=0.999, gae_lambda=0.98, update_epochs=4, network=RELU)
+FLAT = PPO(
+    num_envs=64,
+    n_steps=64,
+    batch_size=256,
+    learning_rate=1e-3,
+    gamma=0.999,
+    gae_lambda=0.98,
+    update_epochs=4,
+    network=RELU,
+)
 
 hierarchy = Hierarchy(
     env="LunarLander-v3",

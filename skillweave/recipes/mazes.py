@@ -168,6 +168,7 @@ register_encoder("map of a maze", Map)
 
 MAP = Network(hidden=(128, 128), activation="relu", encoder="map of a maze")
 BALL = PPO(
+    learning_rate=1e-3,
     min_advantage_std=0.0,  # the figures were measured with it
     num_envs=32,
     n_steps=32,
@@ -180,6 +181,7 @@ BALL = PPO(
     network=Network(hidden=(32, 32), activation="relu", encoder="motion in a maze"),
 )
 SELECTOR = PPO(
+    learning_rate=1e-3,
     min_advantage_std=0.0,  # the figures were measured with it
     num_envs=32,
     n_steps=256,

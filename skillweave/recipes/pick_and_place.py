@@ -200,6 +200,7 @@ behaviour_tree = sw.tree.Sequence(
 
 RELU = Network(hidden=(64, 64), activation="relu")
 LEARNER = PPO(
+    learning_rate=1e-3,
     min_advantage_std=0.0,  # the figures were measured with it
     num_envs=16,
     n_steps=128,

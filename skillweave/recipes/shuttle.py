@@ -115,6 +115,7 @@ RUNNER = PPO(
 """The learner of a skill. It does not see the leg, so that it serves patrols with other legs: with
 the leg, ``backward`` would learn only those legs in which the source task runs backwards."""
 SELECTOR = PPO(
+    learning_rate=1e-3,
     min_advantage_std=0.0,  # the figures were measured with it
     num_envs=64,
     n_steps=64,
