@@ -177,7 +177,7 @@ def collapsed(**settings):
     """An algorithm of two choices, and a state that takes the first one nearly always."""
     config = PPO(
         epsilon=0.3, network=SMALL, normalize_obs=False, learning_rate_schedule="constant",
-        **settings,
+        update_epochs=10, **settings,
     )  # fmt: skip
     algorithm = make_algorithm(config, SEEN, gym.spaces.Discrete(2))
     state = algorithm.init([Seeds(0)])
