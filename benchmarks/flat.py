@@ -1,7 +1,8 @@
 """Figures 4 and 5: flat PPO, training time until an evaluation reaches 200, score after 30 s.
 
-    python -m benchmarks.flat [--seeds 0 1 2 3 4] [--steps 2500000]
+    python -m benchmarks.flat [--seeds 0 1 2 3 4] [--steps 2500000] [--plain]
 
+It has the settings of the recipe ``lunar-lander``; with ``--plain`` it is ``PPO()``.
 The policy is copied once a second of training and scored afterwards, greedily, over 100 episodes
 of Gymnasium's environment with seeds that training never saw.
 """
@@ -13,7 +14,7 @@ from typing import Any
 
 from benchmarks.bare import train_bare
 from benchmarks.common import median, report, table, warm_up
-from skillweave import recipes
+from skillweave import PPO, recipes
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.training.episodes import Tick
@@ -21,9 +22,9 @@ from skillweave.training.evaluation import evaluate
 from skillweave.training.learner import Stack
 
 
-def learn(seed: int, steps: int, every: float) -> dict[str, object]:
+def learn(seed: int, steps: int, every: float, plain: bool) -> dict[str, object]:
     hierarchy = recipes.load("lunar-lander")
-    config = hierarchy.train_defaults.flat or hierarchy.algorithm
+    config = PPO() if plain else hierarchy.train_defaults.flat or hierarchy.algorithm
     copies: list[tuple[float, int, AgentPolicy]] = []
 
     last: list[Tick] = []
@@ -62,11 +63,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--steps", type=int, default=2_500_000)
     parser.add_argument("--every", type=float, default=1.0)
+    parser.add_argument("--plain", action="store_true")
     given = parser.parse_args()
     warm_up()
     rows: list[dict[str, Any]] = []
     for seed in given.seeds:
-        rows.append(learn(seed, given.steps, given.every))
+        rows.append(learn(seed, given.steps, given.every, given.plain))
         shown = [k for k in rows[0] if k != "curve"]
         print(table(shown, [[_short(r[k]) for k in shown] for r in rows]), flush=True)
     times = [r["seconds_to_200"] or float("inf") for r in rows]
