@@ -15,6 +15,9 @@ from skillweave.errors import DeclarationError, TrainingError
 
 PROGRAMS = 64
 """The most programs of one gradient step: by size, rows with gaps, and reference policy."""
+PAYS_AFTER = 20_000
+"""Gradient steps that "auto" takes as they are. They last about as long as it takes to compile one,
+so no training takes more than about twice the time that the better way would have taken."""
 
 
 class Compiled:
@@ -22,8 +25,8 @@ class Compiled:
 
     Args:
         function: tensor operations, which may differentiate within; nothing else.
-        config: settings whose ``compile`` is True or "auto". With "auto" a function that cannot
-            be compiled runs as it is.
+        config: settings whose ``compile`` is True or "auto". With "auto" it is compiled after
+            ``PAYS_AFTER`` calls, and runs as it is where it cannot be compiled.
         sizes_vary: a size that changes causes one more compilation, for any size there.
 
     Raises:
@@ -41,6 +44,8 @@ class Compiled:
         self._setting = f"{type(config).__name__}.compile"
         self._auto = config.compile == "auto"
         self._program: Callable[..., Any] | None = None
+        self._waits = PAYS_AFTER if self._auto else 0
+        """Calls until it is compiled."""
         if hasattr(dynamo, "trace_autograd_ops"):
             return
         if not self._auto:
@@ -60,6 +65,9 @@ class Compiled:
         from torch._dynamo import config as dynamo, exc
 
         if self._program is self._function:
+            return self._function(*args)
+        if self._waits:
+            self._waits -= 1
             return self._function(*args)
         if self._program is None:
             # One algorithm's programs do not count against another's limit.

@@ -128,8 +128,9 @@ class PPO(OnPolicy):
     """The critic's network; None: as the actor's."""
     compile: bool | Literal["auto"] = False
     """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute;
-    a later process waits for a few seconds. auto: where that is possible. Weights differ in their
-    last bits, also of a run that was stopped and goes on."""
+    a later process waits for a few seconds. auto: after 20,000 gradient steps, where it is
+    possible, so that short trainings do not wait. Weights differ in their last bits, also of a run
+    that was stopped and goes on."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -269,8 +270,9 @@ class OffPolicy:
     """Torch threads while learning."""
     compile: bool | Literal["auto"] = False
     """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute;
-    a later process waits for a few seconds. auto: where that is possible. Weights differ in their
-    last bits, also of a run that was stopped and goes on."""
+    a later process waits for a few seconds. auto: after 20,000 gradient steps, where it is
+    possible, so that short trainings do not wait. Weights differ in their last bits, also of a run
+    that was stopped and goes on."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Device of learning; auto: a GPU if available. Acting runs on the CPU."""
 

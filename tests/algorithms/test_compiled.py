@@ -18,7 +18,7 @@ from toys import transitions
 
 from skillweave import DQN, PPO, SAC, TD3, Network, SkillweaveError
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms import RNN, SelfImitationPPO, register_encoder
+from skillweave.algorithms import RNN, SelfImitationPPO, compiled, register_encoder
 from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.batches import Reference, Rehearsal, Rollout
 from skillweave.algorithms.compiled import Compiled
@@ -191,8 +191,20 @@ class Branching:
 register_encoder("branching", Branching)
 
 
+def test_auto_compiles_where_a_training_is_long(monkeypatch):
+    monkeypatch.setattr(compiled, "PAYS_AFTER", 2)
+    tried, seen = Compiled(torch.sin, PPO(compile="auto")), []
+    at_once = Compiled(torch.sin, PPO(compile=True))
+    for _ in range(3):
+        torch.testing.assert_close(tried(torch.ones(3)), torch.ones(3).sin())
+        at_once(torch.ones(3))
+        seen.append((tried._program is None, at_once._program is None))
+    assert seen == [(True, False), (True, False), (False, False)]
+
+
 @pytest.mark.slow
-def test_what_cannot_be_compiled_goes_on_without_where_it_is_tried():
+def test_what_cannot_be_compiled_goes_on_without_where_it_is_tried(monkeypatch):
+    monkeypatch.setattr(compiled, "PAYS_AFTER", 0)
     network, says = Network((8,), encoder="branching"), r"PPO\.compile: the gradient step could not"
     algorithm, state = small_ppo(network=network, compile=True)
     with pytest.raises(SkillweaveError, match=f"{says}.*or leave it at False"):
@@ -231,7 +243,9 @@ def test_no_compiler_says_so_but_where_it_is_tried(tmp_path):
     code = """
 import torch
 from skillweave import PPO, SAC, SkillweaveError
+from skillweave.algorithms import compiled
 from skillweave.algorithms.compiled import Compiled
+compiled.PAYS_AFTER = 0
 try:
     Compiled(lambda x: x.sin().cos(), SAC(compile=True))(torch.randn(3))
 except SkillweaveError as error:
