@@ -51,7 +51,7 @@ class OnPolicy:
     """Environments stepped side by side."""
     n_steps: Amount = 64
     """Environment steps of each environment between updates, for selectors too."""
-    learning_rate: LearningRate = 1.5e-3
+    learning_rate: LearningRate = 1e-3
     """Adam's step size, at the start; or ``Linear(start, end)``, or a function of the share of the
     budget that remains, 1 at the start and 0 at the end, as in Stable-Baselines3."""
     gamma: Fraction = 0.995
@@ -80,9 +80,9 @@ class PPO(OnPolicy):
         DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    batch_size: AtLeastOne = 512
+    batch_size: AtLeastOne = 256
     """Approximate samples of a gradient step (a minibatch); a smaller rollout is one minibatch."""
-    update_epochs: Amount = 8
+    update_epochs: Amount = 10
     """Passes over each rollout."""
     learning_rate_schedule: Literal["constant", "linear", "kl"] = "linear"
     """constant; linear: falls to 0 over the budget; kl: follows target_kl. Counts where
