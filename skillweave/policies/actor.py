@@ -56,7 +56,7 @@ class Actor:
         size = sum(deployed.acts.counts)
         self._real = [path for path, leaf in leaves.items() if leaf.record.kind == "f"]
         kinds = {leaf.record for leaf in leaves.values()}
-        self._only = kinds.pop() if len(kinds) == 1 and len(self._real) == len(leaves) else None
+        self._one_type = kinds.pop() if len(kinds) == 1 and len(self._real) == len(leaves) else None
         """The type of all numbers of an observation, if they are real and of one type."""
         self._choices = {path: leaf for path, leaf in leaves.items() if leaf.kind != "Box"}
         """The parts of observations that are choices, which networks see one-hot."""
@@ -143,7 +143,7 @@ class Actor:
                     f"{str(part[0].tolist())[:100]}, which is not in {choices}"
                 )
         # One look at all numbers takes a fraction of the time.
-        if self._only is not None and not np.isnan(seen.view(self._only)).any():
+        if self._one_type is not None and not np.isnan(seen.view(self._one_type)).any():
             return seen
         for path in self._real:
             part = at(seen, path)
