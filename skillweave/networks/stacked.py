@@ -55,9 +55,9 @@ class Layout:
 
     def gradient(self, loss: Tensor, leaves: Views) -> Tensor:
         """Return the gradient (P, D) of ``loss`` (P,) by ``leaves``; 0 for unused leaves."""
-        # Members do not mix: the gradient of their sum is each member's own.
-        ones = torch.ones_like(loss)
-        gradients = torch.autograd.grad(loss, list(leaves.values()), ones, allow_unused=True)
+        # Members do not mix: the gradient of the sum is each member's own. With a gradient of each
+        # loss instead of the sum, torch would import its symbolic shapes, for a third of a second.
+        gradients = torch.autograd.grad(loss.sum(), list(leaves.values()), allow_unused=True)
         flat = [
             torch.zeros_like(leaf).flatten(1) if g is None else g.flatten(1)
             for g, leaf in zip(gradients, leaves.values(), strict=True)
