@@ -126,8 +126,8 @@ def declare(
         engine: auto: in EnvPool, where it is installed; sync: in Python.
     """
     # Here minibatches twice as large, with a rate √2 times as high, are as good and take less time.
-    # Other rooms are taken to be harder: where successes are rare at first, PPO
-    # forgets one before the next comes.
+    # Other rooms are taken to be harder: where successes are rare at first, PPO forgets one before
+    # the next comes.
     here = room == ROOM
     fast: dict[str, Any] = {"batch_size": 512, "learning_rate": 1.4e-3}
     learner = algorithm(**fast) if here else algorithm(sw.algorithms.SelfImitationPPO)

@@ -267,8 +267,8 @@ MISTAKES: list[tuple[str, Callable[[], Any], str]] = [
     ),
     (
         "DeclarationError",
-        lambda: sw.PPO(num_envs=4, n_steps=8, batch_size=1024),
-        "batch_size is 1024",
+        lambda: sw.PPO(num_envs=4, n_steps=8, batch_size=512),
+        "batch_size is 512",
     ),
     (
         "DeclarationError",

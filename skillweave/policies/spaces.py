@@ -184,9 +184,13 @@ class Space:
         Raises:
             PolicyError: it does not fit.
         """
-        if type(value) is np.ndarray and value.dtype == self.record and value.shape == self.shape:
-            return value
         if self.parts is None:
+            if (
+                type(value) is np.ndarray
+                and value.dtype == self.record
+                and value.shape == self.shape
+            ):
+                return value
             try:
                 found = np.asarray(value)
                 # A row of a table, for example; None would become a NaN.
