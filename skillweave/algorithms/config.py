@@ -51,7 +51,7 @@ class OnPolicy:
     """Environments stepped side by side."""
     n_steps: Amount = 64
     """Environment steps of each environment between updates, for selectors too."""
-    learning_rate: LearningRate = 1e-3
+    learning_rate: LearningRate = 3e-3
     """Adam's step size, at the start; or ``Linear(start, end)``, or a function of the share of the
     budget that remains, 1 at the start and 0 at the end, as in Stable-Baselines3."""
     gamma: Fraction = 0.995
@@ -80,9 +80,10 @@ class PPO(OnPolicy):
         DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    batch_size: AtLeastOne = 256
-    """Approximate samples of a gradient step (a minibatch); a smaller rollout is one minibatch."""
-    update_epochs: Amount = 10
+    batch_size: AtLeastOne | None = None
+    """Approximate samples of a gradient step (a minibatch); a smaller rollout is one minibatch.
+    None: an eighth of the rollout, but at least 64."""
+    update_epochs: Amount = 5
     """Passes over each rollout."""
     learning_rate_schedule: Literal["constant", "linear", "kl"] = "linear"
     """constant; linear: falls to 0 over the budget; kl: follows target_kl. Counts where
@@ -140,9 +141,13 @@ class PPO(OnPolicy):
             check(self, "critic", self.critic is None, "None where network.rnn is set")
             check(self, "compile", self.compile is not True, "False where network.rnn is set")
         rollout = self.num_envs * self.n_steps
-        most = max(rollout, PPO.batch_size)  # a small rollout alone is no mistake
+        most = max(rollout, 256)  # a small rollout alone is no mistake
         rule = f"at most {most}; a rollout has num_envs * n_steps ({rollout}) samples"
-        check(self, "batch_size", self.batch_size <= most, rule)
+        check(self, "batch_size", (self.batch_size or 1) <= most, rule)
+
+    def minibatch(self, samples: int) -> int:
+        """Return the approximate samples of a gradient step, in a rollout of ``samples``."""
+        return self.batch_size or max(64, samples // 8)
 
 
 @settings
@@ -161,8 +166,8 @@ class SelfImitationPPO(PPO):
     imitation_rows: Rows = 4096
     """The latest good rows that are kept."""
     imitation_steps: Amount = 8
-    """The most gradient steps on kept rows after each update, each on ``batch_size`` rows; at most
-    one pass over the kept rows."""
+    """The most gradient steps on kept rows after each update, each on as many rows as a minibatch
+    of a full rollout has; at most one pass over the kept rows."""
     imitation_coef: NonNegative = 1.0
     """Weight of the imitation's policy loss."""
     imitation_vf_coef: NonNegative = 0.01

@@ -190,6 +190,14 @@ def test_without_an_entropy_bonus_a_fresh_policy_does_not_move_until_something_i
     assert not torch.equal(state.params, before)
 
 
+@pytest.mark.parametrize(
+    ("size", "given", "found"),
+    [(4096, None, 512), (512, None, 64), (30, None, 64), (4096, 100, 100)],
+)
+def test_without_a_batch_size_a_minibatch_is_an_eighth_of_the_rollout(size, given, found):
+    assert PPO(batch_size=given).minibatch(size) == found
+
+
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("action_std", ["parameter", "state"])
 def test_where_nothing_is_paid_the_entropy_bonus_does_not_widen_the_deviation_for_ever(action_std):

@@ -151,7 +151,7 @@ SETTINGS = {
     "flat.learning_rate=1e-4": (
         lambda d: (
             (flat := d.train_defaults.flat)
-            and (flat.learning_rate, d.algorithm.learning_rate) == (1e-4, 1e-3)
+            and (flat.learning_rate, d.algorithm.learning_rate) == (1e-4, 3e-3)
         )
     ),
     "skills.center.steps=2e4": lambda d: d.budgets()["center"] == 20_000,
