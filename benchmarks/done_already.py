@@ -19,7 +19,7 @@ from typing import Any
 from benchmarks.declarations import compare, gained, scored
 from benchmarks.declared_worlds import Locked, Switches
 from examples.bridge import AXE, BRIDGE, WOOD, River
-from skillweave import EnvSpec, Hierarchy, Skill, Step
+from skillweave import PPO, EnvSpec, Hierarchy, Skill, Step
 from skillweave.toys import KeyDoor
 from skillweave.types import Array
 
@@ -120,10 +120,19 @@ CHAINS: dict[str, tuple[Any, Callable[[bool], list[Skill]], int]] = {
 """Environment, skills (closed or open) and steps."""
 
 
+LEARNER = PPO(num_envs=64, n_steps=64, batch_size=256, update_epochs=10, learning_rate=1e-3)
+
+
 def score(name: str, way: str, seed: int, out: Path) -> float:
     """Return the mean return of 100 episodes after training."""
     env, skills, steps = CHAINS[name]
-    hierarchy = Hierarchy(EnvSpec(env, workers=1), skills(way == "closed"), steps=steps)
+    hierarchy = Hierarchy(
+        EnvSpec(env, workers=1),
+        skills(way == "closed"),
+        algorithm=LEARNER,
+        selector=LEARNER,
+        steps=steps,
+    )
     return scored(hierarchy, out / f"{name}-{way}-{seed}", seed)
 
 

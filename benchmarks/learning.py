@@ -148,6 +148,7 @@ FIGURES = {
             n_steps=64,
             batch_size=512,
             update_epochs=6,
+            learning_rate=1e-3,
             gamma=0.999,
             gae_lambda=0.98,
             ent_coef=0.0,
@@ -171,9 +172,11 @@ FIGURES = {
     "image": Figure(
         FREEWAY,
         PPO(
+            num_envs=64,
             n_steps=128,
             batch_size=1024,
             update_epochs=4,
+            learning_rate=1e-3,
             gamma=0.99,
             gae_lambda=0.95,
             network=small(64),

@@ -52,6 +52,7 @@ MEMBER = PPO(
     n_steps=64,
     batch_size=128,
     update_epochs=4,
+    learning_rate=1e-3,
     gae_lambda=0.98,
     network=Network((64, 64), "relu"),
 )

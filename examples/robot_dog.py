@@ -173,7 +173,15 @@ def main():
     args = parser.parse_args()
     env = sw.EnvSpec(one_of(Missions), pool=Missions)
     if args.flat:
-        run = sw.train_agent(env, sw.PPO(gamma=0.998), args.steps, args.out, seed=args.seed)
+        flat = sw.PPO(
+            num_envs=64,
+            n_steps=64,
+            batch_size=256,
+            update_epochs=10,
+            learning_rate=1e-3,
+            gamma=0.998,
+        )
+        run = sw.train_agent(env, flat, args.steps, args.out, seed=args.seed)
     else:
         learnt = sw.PPO(  # it sees the point alone
             num_envs=16,

@@ -114,7 +114,14 @@ class Reach(sw.Skill):
 
 def algorithm(**how: Any) -> sw.PPO:
     """Return the learner's settings."""
-    return sw.PPO(**how)
+    settings: dict[str, Any] = {
+        "num_envs": 64,
+        "n_steps": 64,
+        "batch_size": 256,
+        "update_epochs": 10,
+        "learning_rate": 1e-3,
+    }
+    return sw.PPO(**settings | how)
 
 
 def declare(steps: int = 300_000, workers: int | None = None, **how: Any) -> sw.Hierarchy:

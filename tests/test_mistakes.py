@@ -179,7 +179,7 @@ MISTAKES: list[tuple[str, Callable[[], Any], str]] = [
     (
         "EnvError",
         lambda: sw.train_agent(lambda: World(gym.spaces.Discrete(1_000_000)), sw.PPO(), 64),
-        "observations at once: 16.4 GB",
+        "observations at once: 8.2 GB",
     ),
     (
         "EnvError",

@@ -47,7 +47,7 @@ class OnPolicy:
         DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    num_envs: Amount = 64
+    num_envs: Amount = 32
     """Environments stepped side by side."""
     n_steps: Amount = 64
     """Environment steps of each environment between updates, for selectors too."""
@@ -82,7 +82,7 @@ class PPO(OnPolicy):
 
     batch_size: AtLeastOne | None = None
     """Approximate samples of a gradient step (a minibatch); a smaller rollout is one minibatch.
-    None: an eighth of the rollout, but at least 64."""
+    None: an eighth of num_envs * n_steps, at least 64."""
     update_epochs: Amount = 5
     """Passes over each rollout."""
     learning_rate_schedule: Literal["constant", "linear", "kl"] = "linear"
@@ -143,11 +143,12 @@ class PPO(OnPolicy):
         rollout = self.num_envs * self.n_steps
         most = max(rollout, 256)  # a small rollout alone is no mistake
         rule = f"at most {most}; a rollout has num_envs * n_steps ({rollout}) samples"
-        check(self, "batch_size", (self.batch_size or 1) <= most, rule)
+        check(self, "batch_size", self.minibatch <= most, rule)
 
-    def minibatch(self, samples: int) -> int:
-        """Return the approximate samples of a gradient step, in a rollout of ``samples``."""
-        return self.batch_size or max(64, samples // 8)
+    @property
+    def minibatch(self) -> int:
+        """The approximate samples of a gradient step."""
+        return self.batch_size or max(64, self.num_envs * self.n_steps // 8)
 
 
 @settings
@@ -167,7 +168,7 @@ class SelfImitationPPO(PPO):
     """The latest good rows that are kept."""
     imitation_steps: Amount = 8
     """The most gradient steps on kept rows after each update, each on as many rows as a minibatch
-    of a full rollout has; at most one pass over the kept rows."""
+    has; at most one pass over the kept rows."""
     imitation_coef: NonNegative = 1.0
     """Weight of the imitation's policy loss."""
     imitation_vf_coef: NonNegative = 0.01

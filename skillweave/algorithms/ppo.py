@@ -171,8 +171,7 @@ class PPOAlgorithm(Algorithm):
         learn = self._compiled if compiles else self.learn
         active = count > 0
         all_learn = not limited and samples.valid is None
-        batch_size = cfg.minibatch(samples.most)
-        for minibatch in minibatches(samples, rng, cfg.update_epochs, batch_size):
+        for minibatch in minibatches(samples, rng, cfg.update_epochs, cfg.minibatch):
             if batch.rehearsal is not None:
                 size = minibatch.advantage.shape[1]
                 terms.rehearsal = self._drawn(state, batch.rehearsal, size, rng)

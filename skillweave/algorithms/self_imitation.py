@@ -122,12 +122,11 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         total = gain.cumsum(1)
         count = state.kept.sum(1)
         # At most one pass over the kept rows: many passes over few rows would overfit them.
-        size = cfg.minibatch(cfg.num_envs * cfg.n_steps)
-        due = (-(-count // size)).clamp_max(cfg.imitation_steps) * (total[:, -1] > 0.0)
+        due = (-(-count // cfg.minibatch)).clamp_max(cfg.imitation_steps) * (total[:, -1] > 0.0)
         for step in range(cfg.imitation_steps):
             if all_false(active := step < due):
                 break
-            drawn = torch.stack([torch.rand(size, generator=g, **FLOAT) for g in rng])
+            drawn = torch.stack([torch.rand(cfg.minibatch, generator=g, **FLOAT) for g in rng])
             place = torch.searchsorted(total, drawn.to(total.device) * total[:, -1:], right=True)
             # Rounding may lead beyond the last row; in a member without rows it always does.
             place = place.clamp_max(total.shape[1] - 1)

@@ -190,12 +190,10 @@ def test_without_an_entropy_bonus_a_fresh_policy_does_not_move_until_something_i
     assert not torch.equal(state.params, before)
 
 
-@pytest.mark.parametrize(
-    ("size", "given", "found"),
-    [(4096, None, 512), (512, None, 64), (30, None, 64), (4096, 100, 100)],
-)
-def test_without_a_batch_size_a_minibatch_is_an_eighth_of_the_rollout(size, given, found):
-    assert PPO(batch_size=given).minibatch(size) == found
+def test_a_minibatch_is_an_eighth_of_the_rollout_unless_its_size_is_given():
+    assert PPO(num_envs=32, n_steps=64).minibatch == 256
+    assert PPO(num_envs=2, n_steps=8).minibatch == 64
+    assert PPO(num_envs=32, n_steps=64, batch_size=100).minibatch == 100
 
 
 @pytest.mark.fast_cases(1)
