@@ -38,6 +38,7 @@ from skillweave.spaces import action_codec, obs_codec
 from skillweave.workers.shipping import packed
 
 SMALL = sw.PPO(num_envs=4, n_steps=32, batch_size=32)
+HER = sw.SAC(num_envs=4, learning_starts=10, hindsight=True)
 FAST: dict[str, Any] = {"steps": 256, "learn": "apart", "algorithm": SMALL, "selector": SMALL}
 
 
@@ -276,6 +277,27 @@ MISTAKES: list[tuple[str, Callable[[], Any], str]] = [
         "DQN cannot act in Box",
     ),
     ("DeclarationError", lambda: train(algorithm=sw.PPO), "write PPO(), not PPO"),
+    ("DeclarationError", lambda: sw.TD3(hindsight=True), "n_step is 3; it must be 1"),
+    (
+        "DeclarationError",
+        lambda: sw.SAC(hindsight=True, prioritized=True),
+        "prioritized is True; it must be False",
+    ),
+    (
+        "DeclarationError",
+        lambda: train("Pendulum-v1", skills=[skill(algorithm=HER)], algorithm=SMALL),
+        "hindsight, but it has no goals",
+    ),
+    (
+        "DeclarationError",
+        lambda: train("Pendulum-v1", [skill(algorithm=HER, goal_space=PLACE)], algorithm=SMALL),
+        "define achieved_goal(self, obs)",
+    ),
+    (
+        "DeclarationError",
+        lambda: sw.train_agent("Pendulum-v1", HER, 6_000, "runs/r", quiet=True),
+        "no 'achieved_goal' in its observations",
+    ),
     ("DeclarationError", lambda: trained().load("runs/ok").evaluate(episode=5), "'episodes' meant"),
     (
         "DeclarationError",

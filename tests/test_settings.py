@@ -105,6 +105,7 @@ BY_RULE: dict[tuple[Any, str], tuple[Any, ...]] = {
     (Evolution, "selection"): (5, "x", None, []),
     (sw.PPO, "learning_rate"): (0, -1.0, (1, 2), {"start": 1}, {"start": 1, "end": -1}),
     (sw.PPO, "network"): (sw.Network,),
+    (sw.SAC, "hindsight"): ("future", 4, None, {"n_sampled_goal": 0}),
     (sw.Hierarchy, "algorithm"): (sw.PPO,),
     (sw.EnvSpec, "obs_names"): ([5], {"x": "y"}, {"x": [5]}),
 }
@@ -240,8 +241,8 @@ RANGES: dict[Any, str] = {
     ),
     AtLeastOne: (
         "batch_size checkpoint_every collectors episode_calls episodes eval_episodes "
-        "eval_every generations log_calls policy_delay population search_steps selector_steps "
-        "size skill_steps start_calls steps target_update_interval train_freq"
+        "eval_every generations log_calls n_sampled_goal policy_delay population search_steps "
+        "selector_steps size skill_steps start_calls steps target_update_interval train_freq"
     ),
     Count: ("learning_starts"),
     Amount: (
@@ -262,6 +263,7 @@ WORDS: dict[str, set[tuple[str, ...]]] = {
     "compile": {("auto",)},
     "device": {("cpu", "cuda", "auto")},
     "engine": {("auto", "envpool", "sync")},
+    "goal_selection_strategy": {("future", "final", "episode")},
     "keep": {("last", "best")},
     "kind": {("lstm", "gru"), ("plain", "impala")},
     "learn": {("together", "apart", "apart, then together")},

@@ -28,7 +28,7 @@ PUBLIC = {
     },
     "skillweave.algorithms": {
         "algorithms.base": "ActingParams AgentState Algorithm",
-        "algorithms.config": "OnPolicy SelfImitationPPO",
+        "algorithms.config": "Hindsight OnPolicy SelfImitationPPO",
         "algorithms.parameters": "ParameterGroup",
         "algorithms.schedules": "Linear",
         "algorithms.registry": "register_algorithm",

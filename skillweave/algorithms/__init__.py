@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     )
     from skillweave.algorithms.batches import Report as Report, Rollout as Rollout, Sample as Sample
     from skillweave.algorithms.config import (
+        Hindsight as Hindsight,
         OnPolicy as OnPolicy,
         SelfImitationPPO as SelfImitationPPO,
     )

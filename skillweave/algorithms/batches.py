@@ -328,6 +328,21 @@ class Sample:
             yield Sample(**part)
 
 
+@dataclass(frozen=True)
+class RawRows:
+    """Rows (k, …) as the environment gave them, without a reward of a learner."""
+
+    obs: Array
+    next_obs: Array
+    columns: Mapping[str, Array]
+    """Raw columns, by name."""
+
+    def some(self, at: Array) -> RawRows:
+        """Return the rows ``at``."""
+        columns = {name: x[at] for name, x in self.columns.items()}
+        return RawRows(self.obs[at], self.next_obs[at], columns)
+
+
 @dataclass(slots=True)
 class Report:
     """The result of an update: metrics of each member, and the error of each sample."""

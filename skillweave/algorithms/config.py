@@ -217,6 +217,38 @@ Schedule = Literal["constant", "linear"]
 
 
 @settings
+class Hindsight:
+    """Hindsight experience replay (Andrychowicz et al. 2017): what was reached becomes the goal.
+
+    A drawn row is judged again, as if its goal had been one that its call has reached.
+
+    Raises:
+        DeclarationError: a setting is wrong or out of its range; the message names it.
+    """
+
+    n_sampled_goal: AtLeastOne = 4
+    """Rows with a goal that was reached, for each with the goal that its call had."""
+    goal_selection_strategy: Literal["future", "final", "episode"] = "future"
+    """future: reached in this step of the call or a later one; final: in its last step; episode: in
+    any of its steps."""
+
+    @property
+    def share(self) -> float:
+        """Share of drawn rows whose goal is one that was reached."""
+        return self.n_sampled_goal / (self.n_sampled_goal + 1)
+
+
+HindsightValue = Annotated[
+    Hindsight | bool,
+    Check(
+        "True, False or Hindsight()",
+        convert=lambda x: Hindsight() if isinstance(x, bool) and x else x,
+    ),
+]
+"""Settings of hindsight; True becomes ``Hindsight()``."""
+
+
+@settings
 class OffPolicy:
     """Settings that all algorithms with a replay buffer share."""
 
@@ -272,6 +304,9 @@ class OffPolicy:
     budget. Only for policies that act in every step: plain agents, and skills that learn apart."""
     action_repeat_steps: Amount = 60
     """The longest repetition, in steps; lengths are drawn uniformly."""
+    hindsight: HindsightValue = False
+    """Learn also from goals that were reached instead (HER): True, or ``Hindsight(...)``. For
+    skills with goals that define ``achieved_goal``, and agents in environments of goals."""
     threads: Threads = 1
     """Torch threads while learning."""
     compile: bool | Literal["auto"] = False
@@ -298,6 +333,9 @@ class OffPolicy:
             self.buffer_size >= least,
             f"at least {least} (num_envs * (n_step + 1))",
         )
+        if self.hindsight:
+            check(self, "n_step", self.n_step == 1, "1 where hindsight is set")
+            check(self, "prioritized", not self.prioritized, "False where hindsight is set")
 
 
 @settings

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -35,6 +35,7 @@ class ReplayStore:
         n_step, prioritized, alpha: settings of sampling (Schaul et al. 2016).
         between: samples hold the observations between the n steps, too.
         raw: raw columns that are stored; a sample has those that are among its fields.
+        examples, calls: see ``Columns``.
         device: of the samples.
 
     Raises:
@@ -57,11 +58,22 @@ class ReplayStore:
         alpha: float = 0.6,
         between: bool = False,
         raw: Sequence[str] = (),
+        examples: Mapping[str, Array] | None = None,
+        calls: bool = False,
         device: str | torch.device = "cpu",
     ) -> None:
         each = 4 * prioritized * (members if shared else 1)
         self._columns = Columns(
-            capacity, num_envs, observation_space, action, choices, each, shared, raw
+            capacity,
+            num_envs,
+            observation_space,
+            action,
+            choices,
+            each,
+            shared,
+            raw,
+            examples,
+            calls,
         )
         self.num_envs = num_envs
         self._n_step = n_step
@@ -83,6 +95,10 @@ class ReplayStore:
     def raw(self) -> tuple[str, ...]:
         """The raw columns that are stored."""
         return self._columns.raw
+
+    def seen(self, batch: Batch) -> Array:
+        """Return the observations (T, N, …) of a batch as the learner sees them."""
+        return batch["obs"]
 
     @property
     def ready(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -38,6 +38,8 @@ class Columns:
         each: bytes that every transition takes elsewhere.
         keep_rewards: store the reward of every step of a call, so that any γ can be applied.
         raw: names of raw columns of ``SCHEMA`` that are stored unchanged, too.
+        examples: by name, further raw columns, (1, …) of their shape and type.
+        calls: store how many rows of its call follow each row, which ``rows_left`` returns.
 
     Raises:
         TrainingError: the storage is larger than the free memory.
@@ -54,6 +56,8 @@ class Columns:
         each: int,
         keep_rewards: bool,
         raw: Sequence[str],
+        examples: Mapping[str, Array] | None = None,
+        calls: bool = False,
     ) -> None:
         if capacity < num_envs:
             raise DeclarationError(
@@ -70,6 +74,10 @@ class Columns:
             "reward": ((), np.float32),
             "kind": ((), np.uint8),
         }
+        examples = examples or {}
+        kinds |= {name: (x.shape[1:], x.dtype) for name, x in examples.items()}
+        if calls:
+            kinds["left"] = ((), np.int32)
         each += sum(int(np.prod(s)) * np.dtype(d).itemsize for s, d in kinds.values())
         each += 12 * keep_rewards  # the place of a call's rewards, and at least one of them
         what = f"a replay buffer of {capacity:,} transitions of {shape} {item}"
@@ -85,7 +93,10 @@ class Columns:
         self._open = np.zeros(num_envs, bool)  # True where the trajectory goes on
         self._choices = choices
         self._keeps_rewards = keep_rewards
-        self.raw = tuple(raw)
+        self.raw = (*raw, *examples)
+        self._started_raw = tuple(examples)
+        # (N,) the places of the first rows of open calls, or of the next ones.
+        self._begins = np.zeros(num_envs, np.int64)
         # The rewards of calls one after another; "call" holds the first place of a slot's rewards.
         self._rewards = np.zeros(64 * keep_rewards, np.float32)
         self._rewards_used = 0
@@ -112,7 +123,29 @@ class Columns:
 
     def cut(self, columns: Array) -> None:
         """End the open trajectories of ``columns`` (k,), whose environments were reset."""
+        if "left" in self.data:
+            for column in columns[self._open[columns]]:
+                self._close_call(column, self.newest[column] - 1, boundary=True)
         self._open[columns] = False
+
+    def rows_left(self, slot: Array) -> Array:
+        """Return how many rows of its call follow each row, so far where the call goes on."""
+        column = slot % self.num_envs
+        so_far = self.newest[column] - 1 - self.number(slot) // self.num_envs
+        left = self.data["left"].take(slot)
+        return np.where(left < 0, so_far, left)
+
+    def rows_before(self, slot: Array) -> Array:
+        """Return how many rows of its column before each row are still stored, at most."""
+        place = self.number(slot) // self.num_envs
+        oldest = np.maximum(0, self.newest - self.rows + 1)
+        before: Array = place - oldest[slot % self.num_envs]
+        return before
+
+    def further(self, slot: Array, rows: Array) -> Array:
+        """Return the slots of rows that come ``rows`` later in their columns, or earlier."""
+        found: Array = (slot + rows * self.num_envs) % self.slots
+        return found
 
     def after(self, slot: Array) -> Array:
         """Return the next slots of the columns of ``slot``."""
@@ -167,6 +200,8 @@ class Columns:
             if name in state:
                 self._start(name)
         for name in self.raw:
+            if name in self._started_raw:
+                continue
             self.data.pop(name, None)
             if name in state:
                 self._start_raw(name, state[name].numpy())
@@ -181,6 +216,8 @@ class Columns:
         views = {name: array[:used] for name, array in self.data.items()}
         if "call" in views:
             views["rewards"] = self._rewards[: self._rewards_used]
+        if "left" in views:
+            views["begins"] = self._begins
         return views | {"newest": self.newest, "open": self._open}
 
     def _add(self, rows: Batch) -> tuple[Array, Array]:
@@ -189,7 +226,9 @@ class Columns:
         valid = rows.get("valid")
         mask = rows.get("mask")
         next_mask = rows.get("next_mask")
-        slot = self._claim(rows)
+        place = self._claim(rows)
+        slots = place % self.rows * self.num_envs + self._column
+        slot = slots.ravel() if valid is None else slots[valid]
         after = self.after(slot)
 
         def flat(x: Array) -> Array:
@@ -221,10 +260,34 @@ class Columns:
             for slots, x in (after, next_mask), (slot, mask):
                 data["mask"][slots] = 255 if x is None else np.packbits(flat(x), axis=-1)
         data["kind"][slot] = GOES_ON + flat(rows["terminated"])
+        if "left" in data:
+            data["left"][slot] = -1
+            self._close_calls(place, rows)
         return slot, after
 
+    def _close_calls(self, place: Array, rows: Batch) -> None:
+        """Store for the rows of calls that are over how many follow; ``place`` as of ``_claim``."""
+        ended = rows.ended
+        over = ended | (rows["call_end"] != 0)
+        if (valid := rows.get("valid")) is not None:
+            over &= valid
+        for at, column in zip(*np.nonzero(over), strict=True):
+            self._close_call(column, place[at, column], boundary=bool(ended[at, column]))
+
+    def _close_call(self, column: int, last: int, *, boundary: bool) -> None:
+        """Store for the rows of a column's open call how many follow.
+
+        Args:
+            last: the place of its last row.
+            boundary: a boundary follows it.
+        """
+        oldest = self.newest[column] - self.rows + 1  # what is older was overwritten
+        places = np.arange(max(self._begins[column], oldest), last + 1)
+        self.data["left"][places % self.rows * self.num_envs + column] = last - places
+        self._begins[column] = last + 1 + boundary
+
     def _claim(self, rows: Batch) -> Array:
-        """Reserve slots (k,) for the valid rows, in the order of time."""
+        """Reserve places (T, N) for the valid rows: running numbers of the rows of each column."""
         valid = rows.get("valid")
         ended = rows.ended
         place = (self.newest + ~self._open)[None]
@@ -232,17 +295,15 @@ class Columns:
             before = np.ones_like(ended) if valid is None else valid
             slots_needed = before + (ended & before).astype(np.int64)
             place = place + slots_needed.cumsum(0) - slots_needed
-        slot: Array = place % self.rows * self.num_envs + self._column
         if valid is None:
             self.newest = place[-1] + 1
             self._open = ~ended[-1]
-            return slot.ravel()
+            return place
         column = np.flatnonzero(valid.any(0))
         last = len(valid) - 1 - valid[::-1, column].argmax(0), column
         self.newest[column] = place[last] + 1
         self._open[column] = ~ended[last]
-        of_valid: Array = slot[valid]
-        return of_valid
+        return place
 
     def _start(self, name: str) -> None:
         """Start to store "steps", "mask" or "call".

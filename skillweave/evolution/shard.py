@@ -31,7 +31,7 @@ from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Loop, LoopState
 from skillweave.training.periodic import episodes_of
-from skillweave.training.replay_learner import ReplayLearner, store_of
+from skillweave.training.replay_learner import ReplayLearner, judge_of, store_of
 
 OnGenerationTick = Callable[[int, dict[str, float]], None]
 """Receives the steps of all members in this generation so far, and the metrics of an update."""
@@ -63,6 +63,7 @@ class Shard:
     ) -> None:
         self.spaces = learning_task.role.spaces
         self.row_steps = learning_task.role.row_steps
+        self._role = learning_task.role
         self._seeds = seeds
         self._first = first
         each = config.num_envs
@@ -166,7 +167,9 @@ class Shard:
     def _make_store(self, members: Sequence[Member]) -> ReplayStore:
         algorithm = members[0].algorithm(self.spaces)
         count = len(self.places)
-        return store_of(algorithm, count * self.places[0].num_envs, count, shared=True)
+        judge = judge_of(algorithm.config, self._role)
+        num_envs = count * self.places[0].num_envs
+        return store_of(algorithm, num_envs, count, shared=True, judge=judge)
 
     @property
     def tally(self) -> EpisodeTally:

@@ -125,7 +125,8 @@ class OneLearner:
         """
         goes_on = steps["valid"] & ~steps.ended
         steps = steps.replace(valid=trace.get("valid"))
-        batch = rows_of(trace, steps, "", self._record, self._goals, self._part)
+        calls = {"call_end": trace["end"], "call_elapsed": trace["elapsed"]}
+        batch = rows_of(trace, steps, "", self._record, self._goals, self._part, calls)
         return {"": _completed(batch, self._space, self._before, goes_on)}
 
 
@@ -192,7 +193,8 @@ class LevelLearners:
 
     def begin(self, request: Request, elapsed: Array) -> None:
         """Act by a request from now on; ``elapsed`` (N,) are steps of the episodes so far."""
-        self._record, self._gammas = request.record, dict[str, Array]()  # by path, (N,)
+        self._gammas = dict[str, Array]()  # by path, (N,)
+        self._records = {path: below.record for path, below in request.below.items()}
         if self._acting is not None:
             self._begin("", self._acting, request)
         for path, acting in self.root.learners.items():
@@ -329,7 +331,9 @@ class LevelLearners:
             other = own.goal[1:] != own.goal[:-1]
             ends[:-1] |= other.any(axis=tuple(range(2, other.ndim)))
         steps["truncated"][:-1] &= ends[:-1] | ~acts[1:]
-        batch = rows_of(trace, steps, f"{path}/", self._record, goals, part)
+        calls = {"call_end": end, "call_elapsed": own.elapsed}
+        record = self._records[path]
+        batch = rows_of(trace, steps, f"{path}/", record, goals, part, calls)
         space = self._space if part is None else part.action_space
         return _completed(batch, space, self._states.get(path), acts & ~trace.ended)
 

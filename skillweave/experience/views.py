@@ -141,7 +141,7 @@ class OwnSteps:
             info = JointInfo([infos[t] for t in steps] if infos else [], acts[steps])
             elapsed = flat(self.elapsed)
             goal = None if self.goal is None else flat(self.goal)
-            step = _step({name: flat(self.trace[name]) for name in OF_STEP}, elapsed, info)
+            step = step_of({name: flat(self.trace[name]) for name in OF_STEP}, elapsed, info)
             seen = seen_by(skill, step, elapsed, goal=goal)
             try:
                 found = call_method(skill, what, seen, np.nonzero(acts)[1])
@@ -160,12 +160,13 @@ class OwnSteps:
         """Return step ``t`` of environments ``ids`` (k,), as the skill sees it."""
         infos = self.trace.infos
         columns = {name: self.trace[name][t] for name in OF_STEP}
-        step = _step(columns, self.elapsed[t], infos[t] if infos else {})
+        step = step_of(columns, self.elapsed[t], infos[t] if infos else {})
         goal = None if self.goal is None else self.goal[t, ids]
         return seen_by(skill, step, self.elapsed[t, ids], ids, goal)
 
 
-def _step(columns: Mapping[str, Array], elapsed: Array, info: Mapping[str, Any]) -> Step:
+def step_of(columns: Mapping[str, Array], elapsed: Array, info: Mapping[str, Any]) -> Step:
+    """Return a step of the columns of ``OF_STEP``, in which nothing has timed out."""
     fields: dict[str, Any] = {field: columns[name] for name, field in OF_STEP.items()}
     never = np.zeros(len(elapsed), bool)
     return Step(**fields, timed_out=never, elapsed=elapsed, info=info)
@@ -197,26 +198,42 @@ def rows_of(
     record: Sequence[str],
     goals: Goals | None = None,
     part: OwnPart | None = None,
+    of_call: Mapping[str, Array] | None = None,
 ) -> Batch:
     """Return the rows of a learner: its judged steps, with the columns that it learns from.
 
     Args:
         path: before the names of the learner's own columns: empty, or ``inner/up/``.
-        record: names of raw columns.
+        record: names of raw columns. With ``call_end`` among them, rows are to be judged again:
+            observations are the environment's, without a goal.
         goals: of the learner's skill: it observes them, too.
         part: of observations and actions that the learner's skill has; None: it has all.
+        of_call: raw columns of the learner's calls.
     """
-    found = {
-        k: trace.get(k) for k in ("obs", "next_obs", "mask", "next_mask", "overridden", *record)
-    }
+    columns = {**trace, **(of_call or {})}
+    found = {k: columns.get(k) for k in ("mask", "next_mask", "overridden", *record)}
     if part is not None:
-        found |= {k: part.part.see(found[k]) for k in ("obs", "next_obs")}
         found |= {k: part.part.mask(found[k]) for k in ("mask", "next_mask")}
-    if goals is not None:
-        goal = trace[path + "goal"]
-        found |= {k: goals.join(found[k], goal) for k in ("obs", "next_obs")}
+    goal = None if goals is None else trace[path + "goal"]
+    if "call_end" in record:
+        found |= {"obs": trace["obs"], "next_obs": trace["next_obs"], "goal": goal}
+    else:
+        found |= {k: learner_obs(trace[k], goal, goals, part) for k in ("obs", "next_obs")}
     found |= {k: trace.get(path + k) for k in ("action", "dist_params")}
     return steps.replace(**found, steps=np.ones(trace.lead, np.int64))
+
+
+def learner_obs(obs: Array, goal: Any, goals: Goals | None, part: OwnPart | None) -> Array:
+    """Return observations (…, *obs_shape) as a skill's networks see them: its part, and its goal.
+
+    Args:
+        goal: (…, *goal_shape) of its calls; None: it has none.
+        goals: of the skill; None: it has none.
+        part: of the observation that it sees; None: all.
+    """
+    if part is not None:
+        obs = part.part.see(obs)
+    return obs if goals is None else goals.join(obs, goal)
 
 
 def info_numbers_of(trace: Trace, key: str) -> Array:

@@ -66,6 +66,7 @@ _PARAMETERS = {
     "initiation": ("obs",),
     "goals": ("obs", "rng"),
     "clip_goal": ("obs", "goal"),
+    "achieved_goal": ("obs",),
 }
 """The arguments of a skill's methods."""
 
@@ -134,7 +135,7 @@ class Skill:
     color: Color | None = None
 
     methods: ClassVar[tuple[str, ...]] = ("reward", "initiation", "termination", "success")
-    of_goals: ClassVar[tuple[str, ...]] = ("goals", "clip_goal")
+    of_goals: ClassVar[tuple[str, ...]] = ("goals", "clip_goal", "achieved_goal")
 
     _path: str = ""
 
@@ -204,6 +205,13 @@ class Skill:
             goal: (n, *goal_shape), as it was chosen.
         """
         return goal
+
+    def achieved_goal(self, obs: Array) -> Array:
+        """Return the goals that ``obs`` (n, *obs_shape) have reached, (n, *goal_shape).
+
+        A call with such a goal would have succeeded there. Needed for ``hindsight`` alone.
+        """
+        raise NotImplementedError
 
     def defines(self, method: str) -> bool:
         """Return whether the subclass overrides ``method``."""

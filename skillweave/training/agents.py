@@ -39,6 +39,7 @@ from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Loop, LoopState, Saved
 from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 from skillweave.training.rehearsal import rehearse
+from skillweave.training.replay_learner import judge_of
 from skillweave.training.stack_learner import learner_of
 from skillweave.training.stage import Together
 from skillweave.training.stage_log import StageLog, resumed, success_rate
@@ -195,6 +196,7 @@ class Agents:
             self._quota(name),
             row_steps=self.roles[name].row_steps,
             goes_on_at=self.log.at.steps,
+            judge=judge_of(algorithm.config, self.roles[name]),
         )
         if isinstance(learner, RolloutLearner):
             learner.reference = reference

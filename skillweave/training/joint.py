@@ -69,9 +69,8 @@ class JointLearner:
         else:
             rows = max(r.rows for r in requests.values())
             first = Request(rows, (), first.gamma, first.seeds / self._selector)
-        record = tuple(dict.fromkeys(name for r in requests.values() for name in r.record))
         below = {relative(k, self._level): r for k, r in requests.items()}
-        return replace(first, below=below, record=record)
+        return replace(first, below=below)
 
     def take(self, batches: Mapping[str, Batch]) -> None:
         """Give each learner its own rows, and skills the task's advantage, if it has a weight."""

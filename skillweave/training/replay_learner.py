@@ -13,13 +13,18 @@ from torch import Tensor
 from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams
-from skillweave.algorithms.batches import Batch
+from skillweave.algorithms.batches import Batch, RawRows
+from skillweave.buffers.hindsight import HindsightStore, Judge
 from skillweave.buffers.replay import ReplayStore
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import DeclarationError
 from skillweave.experience.acting import ActionRepeat, Request
+from skillweave.experience.judges import GoalEnvJudge, SkillJudge
 from skillweave.ops.device import resolve_device
 from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
 from skillweave.training.learner import Stack, acting_of, member_seeds
+from skillweave.training.role import Role
 
 DRAWN_AT_ONCE = 8
 """Gradient steps whose samples are drawn at once."""
@@ -107,12 +112,13 @@ class ReplayLearner:
         self.store.add(batch)
         valid = batch.get("valid")
         count = batch["reward"].size if valid is None else int(valid.sum())
+        obs = self.store.seen(batch)
         self._transitions[1] += count / self.members
         for i, stack in enumerate(self.stacks):
             columns = self._columns(i)
             stack.algorithm.update_obs_stats(
                 stack.state,
-                _rows(batch["obs"], columns, stack),
+                _rows(obs, columns, stack),
                 None if valid is None else _rows(valid, columns, stack),
             )
         if any(s.algorithm.scales_rewards for s in self.stacks):
@@ -222,34 +228,92 @@ class ReplayLearner:
         return slice(self._first[stack] * each, self._first[stack + 1] * each)
 
 
+def judge_of(config: Any, role: Role) -> Judge | None:
+    """Return who judges a learner's rows under other goals; None: nobody, without hindsight.
+
+    Raises:
+        DeclarationError: the learner cannot have hindsight.
+    """
+    if not getattr(config, "hindsight", False):
+        return None
+    spaces = role.spec.spaces
+    if role.kind == "agent":
+        return GoalEnvJudge(role.spec)
+    if role.skill is None:
+        raise DeclarationError(
+            f"the {role.kind} {role.path!r} cannot learn with hindsight, which is for skills with "
+            "goals and for plain agents: give it an algorithm without hindsight"
+        )
+    return SkillJudge(role.skill, role.part, spaces.observation, spaces.action)
+
+
+def try_judge(judge: Judge, spec: EnvSpec) -> None:
+    """Judge steps that stand still at the start of two episodes, before steps are spent.
+
+    Raises:
+        SkillweaveError: what the user has written cannot judge them.
+    """
+    engine = make_engine(spec, 2)
+    try:
+        obs = engine.reset(0)
+    finally:
+        engine.close()
+    columns = {name: np.repeat(x, 2, axis=0) for name, x in judge.examples.items()}
+    rows = RawRows(obs, obs, columns)
+    reached = judge.achieved(obs)
+    judge.judged(rows, reached)
+    judge.check(rows, reached)
+
+
 def store_of(
-    algorithm: Any, num_envs: int, members: int = 1, *, shared: bool = False
+    algorithm: Any,
+    num_envs: int,
+    members: int = 1,
+    *,
+    shared: bool = False,
+    judge: Judge | None = None,
 ) -> ReplayStore:
     """Return an empty replay store for an algorithm's samples.
 
     Args:
         num_envs: of all members together.
         shared: each member learns from the experience of all.
+        judge: judges rows again; None: without hindsight.
 
     Raises:
         TrainingError: the store is larger than the machine's memory.
         DeclarationError: the store is smaller than one row.
     """
     config, codec = algorithm.config, algorithm.codec
+    capacity = config.buffer_size * (1 if shared else members)
+    choices = codec.size if codec.discrete else 0
+    device = resolve_device(config.device)
+    if judge is not None:
+        return HindsightStore(
+            capacity,
+            num_envs,
+            members,
+            codec.zeros(1),
+            config.hindsight,
+            judge,
+            choices=choices,
+            shared=shared,
+            device=device,
+        )
     return ReplayStore(
-        config.buffer_size * (1 if shared else members),
+        capacity,
         num_envs,
         members,
         algorithm.observation_space,
         codec.zeros(1),
-        choices=codec.size if codec.discrete else 0,
+        choices=choices,
         shared=shared,
         n_step=config.n_step,
         prioritized=config.prioritized,
         alpha=config.priority_alpha,
         between=algorithm.between,
         raw=algorithm.raw,
-        device=resolve_device(config.device),
+        device=device,
     )
 
 

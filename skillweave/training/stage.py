@@ -23,7 +23,7 @@ from skillweave.ops.device import resolve_device
 from skillweave.runs.manifest import StageEntry, Target
 from skillweave.schema import AtLeastOne, Fraction, NonNegative, Positive, settings
 from skillweave.training.learning_task import LearningTask
-from skillweave.training.replay_learner import store_of
+from skillweave.training.replay_learner import judge_of, store_of, try_judge
 from skillweave.training.role import Role
 from skillweave.workers.start_methods import cannot_be_sent, runs_again, why_no_processes
 
@@ -275,6 +275,9 @@ def check_replay(entry: StageEntry, role: Role) -> None:
             f"Have {ONE}, take PPO, or name other stages: evolve={{...}}"
         )
     try:  # unwritten slots take no memory
-        store_of(algorithm, config.num_envs * members, members, shared=members > 1)
+        judge = judge_of(config, role)
+        store_of(algorithm, config.num_envs * members, members, shared=members > 1, judge=judge)
+        if judge is not None:
+            try_judge(judge, role.spec)
     except SkillweaveError as error:
         raise reworded(error, f"stage {entry.name!r}: {error}") from error

@@ -1,0 +1,211 @@
+"""The replay store with hindsight: rows are drawn with goals that their calls have reached.
+
+Hindsight experience replay (Andrychowicz et al. 2017, "Hindsight Experience Replay"), in which ends
+are relabelled, too: the store holds raw rows, and a ``Judge`` computes rewards and ends anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+from torch import Tensor
+
+from skillweave._internal.messages import short
+from skillweave.algorithms.batches import Batch, RawRows, Sample
+from skillweave.algorithms.config import Hindsight
+from skillweave.buffers.replay import ReplayStore
+from skillweave.buffers.replay_storage import NOTHING, TERMINATED
+from skillweave.errors import TrainingError
+from skillweave.policies.core import Array
+
+CHECKED = 1_000
+"""The most rows that are judged again with their own goals, before anything is learnt."""
+
+
+class Judge(Protocol):
+    """A learner's goals, and its reward and ends under other ones."""
+
+    who: str
+    """Begins messages."""
+    observation_space: gym.Space[Any]
+    """The environment's."""
+    examples: Mapping[str, Array]
+    """The raw columns that it reads, (1, …) by name."""
+
+    def goals(self, rows: RawRows) -> Array:
+        """Return the goals that rows (…) had."""
+        ...
+
+    def achieved(self, obs: Array) -> Array:
+        """Return the goals that observations (k, …) have reached."""
+        ...
+
+    def judged(self, rows: RawRows, goal: Array) -> tuple[Array, Array]:
+        """Return rewards (k,) float32 under these goals, and where the value ends, (k,) bool."""
+        ...
+
+    def check(self, rows: RawRows, goal: Array) -> None:
+        """Raise an error where rows cannot be judged under these goals, which they have reached."""
+        ...
+
+    def seen(self, obs: Array, goal: Array) -> Array:
+        """Return observations (…) as the learner sees them, with these goals."""
+        ...
+
+
+class HindsightStore(ReplayStore):
+    """A replay store of raw rows, most of which are drawn with a goal that their call reached.
+
+    Args:
+        how: the share of such rows, and which goals.
+        judge: of the learner.
+        others: as of ``ReplayStore``.
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        num_envs: int,
+        members: int,
+        action: Array,
+        how: Hindsight,
+        judge: Judge,
+        **others: Any,
+    ) -> None:
+        space = judge.observation_space
+        examples = judge.examples
+        super().__init__(
+            capacity, num_envs, members, space, action, examples=examples, calls=True, **others
+        )
+        self._how = how
+        self._judge = judge
+        self._agrees = False
+
+    @property
+    def raw(self) -> tuple[str, ...]:
+        """The raw columns that are needed."""
+        return (*super().raw, "call_end")
+
+    def seen(self, batch: Batch) -> Array:
+        """Return the observations (T, N, …) of a batch as the learner sees them."""
+        rows = RawRows(batch["obs"], batch["next_obs"], batch)
+        return self._judge.seen(rows.obs, self._judge.goals(rows))
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Restore the ``state`` of a store that was made with the same arguments."""
+        super().load(state)
+        self._agrees = False
+
+    def sample(
+        self,
+        batch: int,
+        gamma: Tensor,
+        rngs: Sequence[np.random.Generator],
+        beta: float = 1.0,
+        first: int = 0,
+        progress: float = 0.0,
+    ) -> Sample:
+        """Draw transitions, see ``ReplayStore.sample``, and judge most of them again.
+
+        Raises:
+            TrainingError: rows with their own goals are judged otherwise than they were.
+        """
+        if not self._agrees:
+            self._check()
+            self._agrees = True
+        index, _ = self._draw(batch, rngs, beta, first)
+        slot = index % self._columns.slots
+        chance = np.stack([rng.random((2, batch)) for rng in rngs], axis=1)
+        rows = self._rows(slot)
+        goal = self._judge.goals(rows)
+        reward = self._columns.data["reward"].take(slot)
+        ends = self._columns.data["kind"].take(slot) == TERMINATED
+        again = chance[0] < self._how.share
+        if again.any():
+            later = self._later(slot[again], chance[1][again])
+            obs = self._columns.data["obs"]
+            reached = self._judge.achieved(obs.take(self._columns.after(later), axis=0))
+            goal[again] = reached
+            reward[again], ends[again] = self._judge.judged(rows.some(again), reached)
+        action = self._columns.data["action"].take(slot, axis=0)
+        discount = gamma.float().cpu().numpy()[:, None] * ~ends
+        env_reward = rows.columns.get("env_reward")
+        return Sample(
+            obs=self._tensor(self._judge.seen(rows.obs, goal)),
+            action=self._tensor(action.astype(np.int64) if action.dtype.kind in "iu" else action),
+            reward=self._tensor(reward),
+            discount=self._tensor(discount),
+            next_obs=self._tensor(self._judge.seen(rows.next_obs, goal)),
+            mask=self._mask(slot),
+            next_mask=self._mask(self._columns.after(slot)),
+            weight=None,
+            index=index,
+            env_reward=None if env_reward is None else self._tensor(env_reward),
+            progress=progress,
+        )
+
+    def _rows(self, slot: Array) -> RawRows:
+        """Return the raw rows of slots (…)."""
+        columns = self._columns
+        data = columns.data
+        raw = {name: data[name].take(slot, axis=0) for name in columns.raw if name in data}
+        after = columns.after(slot)
+        return RawRows(data["obs"].take(slot, axis=0), data["obs"].take(after, axis=0), raw)
+
+    def _later(self, slot: Array, chance: Array) -> Array:
+        """Return slots of rows of the same calls, in which the goals are reached; both (k,).
+
+        Args:
+            chance: (k,) in [0, 1).
+        """
+        columns = self._columns
+        left = columns.rows_left(slot)
+        kind = self._how.goal_selection_strategy
+        if kind == "final":
+            return columns.further(slot, left)
+        before = np.zeros_like(left)
+        if kind == "episode":
+            elapsed = columns.data["call_elapsed"].take(slot)
+            before = np.minimum(elapsed - 1, columns.rows_before(slot))
+        drawn = np.floor(chance * (before + left + 1)).astype(np.int64)
+        return columns.further(slot, drawn - before)
+
+    def _check(self) -> None:
+        """Judge stored rows again with their own goals, and compare.
+
+        Raises:
+            TrainingError: they are judged otherwise, or goals make no difference.
+        """
+        filled = np.flatnonzero(self._columns.data["kind"] != NOTHING)
+        slot = filled[:: -(-len(filled) // CHECKED)]
+        rows = self._rows(slot)
+        judge = self._judge
+        given = self._columns.data["reward"].take(slot)
+        ended = self._columns.data["kind"].take(slot) == TERMINATED
+        reward, ends = judge.judged(rows, judge.goals(rows))
+        differ = ~np.isclose(reward, given, rtol=1e-4, atol=1e-6)
+        for what, wrong, now, then in (
+            ("reward", differ, reward, given),
+            ("end", ends != ended, ends, ended),
+        ):
+            if wrong.any():
+                at = int(wrong.argmax())
+                raise TrainingError(
+                    f"{judge.who}: hindsight judges past steps again, but in {int(wrong.sum()):,} "
+                    f"of {len(slot):,} the {what} is another than it was (first {short(now[at])} "
+                    f"for {short(then[at])}): it must depend on the step and the goal alone. "
+                    "Perhaps it draws, keeps a state, or is changed by a wrapper, or the "
+                    "environment shows the next goal already"
+                )
+        reached = judge.achieved(rows.next_obs)
+        other, other_ends = judge.judged(rows, reached)
+        judge.check(rows, reached)
+        if (other == reward).all() and (other_ends == ends).all():
+            raise TrainingError(
+                f"{judge.who}: hindsight changes goals, but in {len(slot):,} steps neither rewards "
+                "nor ends are others under the goal that was reached than under the step's own: "
+                "let the reward depend on the goal, or leave out hindsight"
+            )

@@ -1,0 +1,257 @@
+"""Judges of rows from replay: they compute rewards and ends again, under other goals.
+
+A skill is judged by its own methods, a plain agent by its environment's ``compute_reward``. The
+store that asks them is ``buffers.hindsight.HindsightStore``.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterator, Mapping
+from typing import Any, NoReturn
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave._internal.messages import error_text
+from skillweave.algorithms.batches import OF_STEP, RawRows
+from skillweave.envs.make import EnvSpec
+from skillweave.errors import DeclarationError, EnvError, SkillError, TrainingError
+from skillweave.experience.views import learner_obs, step_of
+from skillweave.policies.core import Array, Step, part_of, read_only
+from skillweave.policies.spaces import space_of
+from skillweave.skills import Skill, call_method
+from skillweave.skills.base import path_of
+from skillweave.skills.goals import Goals
+from skillweave.skills.outputs import call_user
+from skillweave.skills.own_part import OwnPart
+
+ACHIEVED, DESIRED = "achieved_goal", "desired_goal"
+"""Parts of the observations of an environment of goals."""
+
+
+class SkillJudge:
+    """The judge of a skill with goals.
+
+    Args:
+        part: of observations that it sees; None: all.
+
+    Raises:
+        DeclarationError: the skill has no goals, or does not say what it has reached.
+    """
+
+    def __init__(
+        self,
+        skill: Skill,
+        part: OwnPart | None,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+    ) -> None:
+        self.who = f"skill {path_of(skill)!r}"
+        if skill.goal_space is None:
+            raise DeclarationError(
+                f"{self.who}: its algorithm has hindsight, but it has no goals: set goal_space, or "
+                "give it an algorithm of its own without hindsight"
+            )
+        if not skill.defines("achieved_goal"):
+            raise DeclarationError(
+                f"{self.who}: its algorithm has hindsight, but it does not say what it reaches: "
+                "define achieved_goal(self, obs), which returns the goals that are reached in obs, "
+                "(n, *goal_shape)"
+            )
+        if skill.reward_changes:
+            raise DeclarationError(
+                f"{self.who}: its algorithm has hindsight, which computes rewards of past steps "
+                "again, but reward_changes says that they would be others"
+            )
+        self._skill = skill
+        self._part = part
+        self._goals = Goals(skill)
+        self.observation_space: gym.Space[Any] = observation_space
+        flag, number = np.zeros(1, bool), np.zeros(1, np.float32)
+        self.examples: Mapping[str, Array] = {
+            "goal": self._goals.start(1),
+            "env_action": space_of(action_space).start(1),
+            "env_reward": number,
+            "env_terminated": flag,
+            "env_truncated": flag,
+            "call_elapsed": np.zeros(1, np.int64),
+        }
+
+    def goals(self, rows: RawRows) -> Array:
+        """Return the goals that rows (…) had."""
+        return rows.columns["goal"].copy()
+
+    def achieved(self, obs: Array) -> Array:
+        """Return the goals that observations (k, …) have reached.
+
+        Raises:
+            SkillError: the skill's ``achieved_goal`` failed, or returned something else.
+        """
+        who = f"{self.who}: achieved_goal()"
+        given = call_user(self._skill.achieved_goal, read_only(obs), who)
+        goals = self._goals.space.goals(given, len(obs), who, self.who)
+        numbers = self._goals.space.leaves.values()
+        if any(leaf.kind != "Box" for leaf in numbers):  # no network can see other choices
+            return self._goals.inside(goals, who)
+        if not all(np.isfinite(x).all() for x in _numbers(goals)):
+            raise SkillError(f"{who} returned NaN or infinity")
+        return goals
+
+    def judged(self, rows: RawRows, goal: Array) -> tuple[Array, Array]:
+        """Return the skill's rewards, and its and the environment's ends."""
+        step = self._step(rows, goal)
+        ids = np.arange(len(goal))
+        ends = rows.columns["env_terminated"]
+        if self._skill.defines("termination"):
+            ends = ends | call_method(self._skill, "termination", step, ids)
+        return call_method(self._skill, "reward", step, ids), ends
+
+    def check(self, rows: RawRows, goal: Array) -> None:
+        """Raise a SkillError where the skill's success reads what is not stored."""
+        if self._skill.defines("success"):
+            call_method(self._skill, "success", self._step(rows, goal), np.arange(len(goal)))
+
+    def seen(self, obs: Array, goal: Array) -> Array:
+        """Return observations (…) as the skill's networks see them."""
+        return learner_obs(obs, goal, self._goals, self._part)
+
+    def _step(self, rows: RawRows, goal: Array) -> Step:
+        columns = {"obs": rows.obs, "next_obs": rows.next_obs, **rows.columns}
+        elapsed = columns["call_elapsed"]
+        info = _NoInfo(self.who)
+        step = step_of({name: columns[name] for name in OF_STEP}, elapsed, info)
+        return part_of(step, elapsed, None, self._skill.max_steps, goal)
+
+
+class _NoInfo(Mapping[str, Any]):
+    """The info of rows that are judged again: it was not stored."""
+
+    def __init__(self, who: str) -> None:
+        self._who = who
+
+    def _refuse(self, key: object) -> NoReturn:
+        raise DeclarationError(
+            f"{self._who}: its algorithm has hindsight, which judges past steps again, but reads "
+            f"info[{key!r}], which may be another one under another goal: compute it from "
+            "step.next_obs"
+        )
+
+    def __getitem__(self, key: str) -> Any:
+        self._refuse(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Raise a DeclarationError that names the key."""
+        self._refuse(key)
+
+    def __contains__(self, key: object) -> bool:
+        self._refuse(key)
+
+    def __iter__(self) -> Iterator[str]:
+        self._refuse("any key")
+
+    def __len__(self) -> int:
+        return 0
+
+
+class GoalEnvJudge:
+    """The judge of a plain agent in an environment of goals: the environment itself.
+
+    Such environments (gymnasium-robotics) observe ``achieved_goal`` and ``desired_goal``, and
+    compute rewards, and perhaps ends, of many pairs of these at once. One of them answers.
+
+    Raises:
+        DeclarationError: it is none.
+    """
+
+    def __init__(self, spec: EnvSpec) -> None:
+        self.who = f"the environment {spec.name}"
+        space: gym.Space[Any] = spec.spaces.observation
+        self.observation_space = space
+        parts = space.spaces if isinstance(space, gym.spaces.Dict) else {}
+        if missing := [name for name in (ACHIEVED, DESIRED) if name not in parts]:
+            raise DeclarationError(
+                f"hindsight needs goals, but {self.who} has no {missing[0]!r} in its observations: "
+                "take an environment of goals (a Dict with observation, achieved_goal and "
+                "desired_goal), or a Hierarchy with a skill that has goals"
+            )
+        env = spec.make()
+        weakref.finalize(self, env.close)
+        self._reward = self._method(env, "compute_reward")
+        if self._reward is None:
+            raise DeclarationError(
+                f"hindsight computes rewards again, but {self.who} has no "
+                "compute_reward(achieved_goal, desired_goal, info)"
+            )
+        self._ends = self._method(env, "compute_terminated")
+        self._one_by_one: set[str] = set()
+        flag = np.zeros(1, bool)
+        self.examples: Mapping[str, Array] = {
+            "env_terminated": flag,
+            "call_elapsed": np.zeros(1, np.int64),
+        }
+
+    @staticmethod
+    def _method(env: gym.Env[Any, Any], name: str) -> Any:
+        return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None
+
+    def goals(self, rows: RawRows) -> Array:
+        """Return the goals that rows (…) had, as they were seen before the steps."""
+        return rows.obs[DESIRED].copy()
+
+    def achieved(self, obs: Array) -> Array:
+        """Return the goals that observations (k,) have reached."""
+        reached: Array = obs[ACHIEVED]
+        return reached
+
+    def judged(self, rows: RawRows, goal: Array) -> tuple[Array, Array]:
+        """Return the environment's rewards and ends."""
+        reached = rows.next_obs[ACHIEVED]
+        reward = self._answers("compute_reward", self._reward, reached, goal, np.float32)
+        if self._ends is not None:
+            return reward, self._answers("compute_terminated", self._ends, reached, goal, np.bool_)
+        ends = rows.columns["env_terminated"]
+        if ends.any():
+            raise TrainingError(
+                f"{self.who} terminates episodes, but has no compute_terminated(achieved_goal, "
+                "desired_goal, info), so it is unknown where they end under another goal: let it "
+                "truncate episodes instead, or define that method"
+            )
+        return reward, ends
+
+    def check(self, rows: RawRows, goal: Array) -> None:
+        """Do nothing: nothing else is computed again."""
+
+    def seen(self, obs: Array, goal: Array) -> Array:
+        """Return observations (…) with these goals as ``desired_goal``."""
+        obs = obs.copy()
+        obs[DESIRED] = goal
+        return obs
+
+    def _answers(self, name: str, method: Any, reached: Array, goal: Array, kind: Any) -> Array:
+        """Return a method's answers (k,), of all pairs at once if it takes them so."""
+        n = len(goal)
+        if name not in self._one_by_one:
+            try:
+                found = np.asarray(method(reached, goal, {}))
+            except Exception:
+                found = None
+            if found is not None and found.shape == (n,):
+                return found.astype(kind)
+            self._one_by_one.add(name)
+        try:
+            each = [method(reached[i], goal[i], {}) for i in range(n)]
+            return np.array([np.asarray(x).reshape(()) for x in each]).astype(kind)
+        except Exception as error:
+            raise EnvError(
+                f"{self.who}: {name}(achieved_goal, desired_goal, {{}}) raised "
+                f"{error_text(error)}; hindsight calls it without info, which belongs to another "
+                "goal"
+            ) from error
+
+
+def _numbers(goals: Array) -> list[Array]:
+    """Return the arrays of goals (n, …), which may have parts."""
+    if goals.dtype.names is None:
+        return [goals]
+    return [x for name in goals.dtype.names for x in _numbers(goals[name])]
