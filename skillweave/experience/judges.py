@@ -13,7 +13,8 @@ from typing import Any, NoReturn
 import gymnasium as gym
 import numpy as np
 
-from skillweave._internal.messages import error_text
+from skillweave._internal.messages import error_text, short
+from skillweave._internal.notices import notice
 from skillweave.algorithms.batches import OF_STEP, RawRows
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, EnvError, SkillError, TrainingError
@@ -28,6 +29,8 @@ from skillweave.skills.own_part import OwnPart
 
 ACHIEVED, DESIRED = "achieved_goal", "desired_goal"
 """Parts of the observations of an environment of goals."""
+MANY = 100
+"""Steps after which one of them should have reached a goal of the space."""
 
 
 class SkillJudge:
@@ -108,9 +111,18 @@ class SkillJudge:
         return call_method(self._skill, "reward", step, ids), ends
 
     def check(self, rows: RawRows, goal: Array) -> None:
-        """Raise a SkillError where the skill's success reads what is not stored."""
+        """Raise a SkillError where the skill's success reads what is not stored.
+
+        A notice is given where many goals were reached, and none of them is one to practise.
+        """
         if self._skill.defines("success"):
             call_method(self._skill, "success", self._step(rows, goal), np.arange(len(goal)))
+        if len(goal) >= MANY and not self._goals.space.holds(goal).any():
+            notice(
+                f"{self.who}: none of the {len(goal):,} goals that achieved_goal() says were "
+                f"reached is in goal_space (the first is {short(goal[0].tolist())}, goal_space is "
+                f"{short(self._skill.goal_space)}): are they in the same units?"
+            )
 
     def seen(self, obs: Array, goal: Array) -> Array:
         """Return observations (…) as the skill's networks see them."""

@@ -277,6 +277,20 @@ def test_goals_that_change_nothing_are_refused(tmp_path):
         going(Same).train(tmp_path / "run", quiet=True)
 
 
+def test_goals_in_other_units_are_told(tmp_path):
+    class Degrees(GoTo):
+        algorithm = replace(HER, learning_starts=120)
+
+        def achieved_goal(self, obs: Any) -> Any:
+            return 57.3 * obs + 10
+
+        def near(self, step: Any) -> Any:
+            return np.linalg.norm(self.achieved_goal(step.next_obs) - step.goal, axis=1) < 9
+
+    with pytest.warns(UserWarning, match="are they in the same units"):
+        going(Degrees).train(tmp_path / "run", quiet=True)
+
+
 def test_a_selector_has_no_hindsight(tmp_path):
     selector = sw.DQN(num_envs=4, learning_starts=20, network=SMALL, hindsight=True)
     goals = gym.spaces.Discrete(3)
