@@ -20,11 +20,11 @@ from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, EnvError, SkillError, TrainingError
 from skillweave.experience.views import learner_obs, step_of
 from skillweave.policies.core import Array, Step, part_of, read_only
-from skillweave.policies.spaces import space_of
+from skillweave.policies.spaces import at, space_of
 from skillweave.skills import Skill, call_method
 from skillweave.skills.base import path_of
-from skillweave.skills.goals import Goals
-from skillweave.skills.outputs import call_user
+from skillweave.skills.goals import Goals, reads_goal
+from skillweave.skills.outputs import call_user, checked
 from skillweave.skills.own_part import OwnPart
 
 ACHIEVED, DESIRED = "achieved_goal", "desired_goal"
@@ -71,7 +71,8 @@ class SkillJudge:
         self._part = part
         self._goals = Goals(skill)
         self.observation_space: gym.Space[Any] = observation_space
-        flag, number = np.zeros(1, bool), np.zeros(1, np.float32)
+        flag = np.zeros(1, bool)
+        number = np.zeros(1, np.float32)
         self.examples: Mapping[str, Array] = {
             "goal": self._goals.start(1),
             "env_action": space_of(action_space).start(1),
@@ -93,12 +94,17 @@ class SkillJudge:
         """
         who = f"{self.who}: achieved_goal()"
         given = call_user(self._skill.achieved_goal, read_only(obs), who)
-        goals = self._goals.space.goals(given, len(obs), who, self.who)
-        numbers = self._goals.space.leaves.values()
-        if any(leaf.kind != "Box" for leaf in numbers):  # no network can see other choices
-            return self._goals.inside(goals, who)
-        if not all(np.isfinite(x).all() for x in _numbers(goals)):
-            raise SkillError(f"{who} returned NaN or infinity")
+        space = self._goals.space
+        goals = space.goals(given, len(obs), who, self.who)
+        for path, leaf in space.leaves.items():
+            numbers = at(goals, path).reshape(len(goals), -1)
+            if leaf.kind == "Box":
+                if not np.isfinite(numbers).all():
+                    raise SkillError(f"{who} returned NaN or infinity")
+                continue
+            low, high = (x.reshape(-1) for x in leaf.bounds)  # no network can see other choices
+            if (wrong := ((numbers < low) | (numbers > high)).any(axis=1)).any():
+                raise SkillError(space.is_out(goals[wrong][0], who, self.who))
         return goals
 
     def judged(self, rows: RawRows, goal: Array) -> tuple[Array, Array]:
@@ -110,14 +116,27 @@ class SkillJudge:
             ends = ends | call_method(self._skill, "termination", step, ids)
         return call_method(self._skill, "reward", step, ids), ends
 
-    def check(self, rows: RawRows, goal: Array) -> None:
-        """Raise a SkillError where the skill's success reads what is not stored.
+    def check(self, rows: RawRows, goal: Array, *, differ: bool) -> None:
+        """Raise an error where the skill's success reads ``info``, or nothing reads the goal.
 
-        A notice is given where many goals were reached, and none of them is one to practise.
+        A notice is given where many goals were reached, and none of them is one to practise, or a
+        success.
         """
+        step = self._step(rows, goal)
+        many = len(goal) >= MANY
         if self._skill.defines("success"):
-            call_method(self._skill, "success", self._step(rows, goal), np.arange(len(goal)))
-        if len(goal) >= MANY and not self._goals.space.holds(goal).any():
+            succeeds = call_method(self._skill, "success", step, np.arange(len(goal)))
+            if many and not succeeds.any():
+                notice(
+                    f"{self.who}: success() is false in all of {len(goal):,} steps under the goals "
+                    "that achieved_goal() says they have reached: does it return another goal?"
+                )
+        if not differ and not reads_goal(self._skill, step, ("reward", "termination")):
+            raise DeclarationError(
+                f"{self.who}: its algorithm has hindsight, but its reward() and termination() are "
+                "the same for every goal: let them depend on step.goal, or leave out hindsight"
+            )
+        if many and not self._goals.space.holds(goal).any():
             notice(
                 f"{self.who}: none of the {len(goal):,} goals that achieved_goal() says were "
                 f"reached is in goal_space (the first is {short(goal[0].tolist())}, goal_space is "
@@ -187,8 +206,15 @@ class GoalEnvJudge:
                 "take an environment of goals (a Dict with observation, achieved_goal and "
                 "desired_goal), or a Hierarchy with a skill that has goals"
             )
+        if parts[ACHIEVED] != parts[DESIRED]:
+            raise DeclarationError(
+                f"{self.who}: what is achieved is {short(parts[ACHIEVED])}, but what is desired is "
+                f"{short(parts[DESIRED])}: hindsight puts one in the other's place, so both must "
+                "have one space"
+            )
         env = spec.make()
         weakref.finalize(self, env.close)
+        env.reset(seed=0)
         self._reward = self._method(env, "compute_reward")
         if self._reward is None:
             raise DeclarationError(
@@ -221,7 +247,7 @@ class GoalEnvJudge:
         reached = rows.next_obs[ACHIEVED]
         reward = self._answers("compute_reward", self._reward, reached, goal, np.float32)
         if self._ends is not None:
-            return reward, self._answers("compute_terminated", self._ends, reached, goal, np.bool_)
+            return reward, self._answers("compute_terminated", self._ends, reached, goal, bool)
         ends = rows.columns["env_terminated"]
         if ends.any():
             raise TrainingError(
@@ -231,8 +257,14 @@ class GoalEnvJudge:
             )
         return reward, ends
 
-    def check(self, rows: RawRows, goal: Array) -> None:
-        """Do nothing: nothing else is computed again."""
+    def check(self, rows: RawRows, goal: Array, *, differ: bool) -> None:
+        """Give a notice where other goals have made no difference in many steps."""
+        if not differ and len(goal) >= MANY:
+            notice(
+                f"{self.who}: in {len(goal):,} steps compute_reward() answers under the goals that "
+                "were reached as it does under the desired ones, so hindsight teaches nothing: "
+                "does it depend on the goal?"
+            )
 
     def seen(self, obs: Array, goal: Array) -> Array:
         """Return observations (…) with these goals as ``desired_goal``."""
@@ -243,27 +275,41 @@ class GoalEnvJudge:
     def _answers(self, name: str, method: Any, reached: Array, goal: Array, kind: Any) -> Array:
         """Return a method's answers (k,), of all pairs at once if it takes them so."""
         n = len(goal)
+        who = f"{self.who}: {name}()"
         if name not in self._one_by_one:
             try:
-                found = np.asarray(method(reached, goal, {}))
+                found = np.asarray(method(_plain(reached), _plain(goal), {}))
             except Exception:
                 found = None
             if found is not None and found.shape == (n,):
-                return found.astype(kind)
+                return _checked(found, n, kind, who)
             self._one_by_one.add(name)
-        try:
-            each = [method(reached[i], goal[i], {}) for i in range(n)]
-            return np.array([np.asarray(x).reshape(()) for x in each]).astype(kind)
-        except Exception as error:
-            raise EnvError(
-                f"{self.who}: {name}(achieved_goal, desired_goal, {{}}) raised "
-                f"{error_text(error)}; hindsight calls it without info, which belongs to another "
-                "goal"
-            ) from error
+        each = []
+        for i in range(n):
+            try:
+                each.append(method(_plain(reached[i]), _plain(goal[i]), {}))
+            except Exception as error:
+                reads = "; hindsight calls it with an empty info" * isinstance(error, KeyError)
+                raise EnvError(f"{who} raised {error_text(error)}{reads}") from error
+            if np.size(each[-1]) != 1 or each[-1] is None:
+                raise EnvError(f"{who} returned {short(each[-1])}, but one number is needed")
+        return _checked(np.array([np.asarray(x).reshape(()) for x in each]), n, kind, who)
 
 
-def _numbers(goals: Array) -> list[Array]:
-    """Return the arrays of goals (n, …), which may have parts."""
+def _checked(found: Array, n: int, kind: Any, who: str) -> Array:
+    """Return an environment's answers (n,) as rewards or ends.
+
+    Raises:
+        EnvError: they are something else, or not finite.
+    """
+    try:
+        return checked(found, n, kind, who)
+    except SkillError as error:
+        raise EnvError(str(error)) from error
+
+
+def _plain(goals: Array) -> Any:
+    """Return a copy of goals for a user's function; parts are a dict of arrays."""
     if goals.dtype.names is None:
-        return [goals]
-    return [x for name in goals.dtype.names for x in _numbers(goals[name])]
+        return goals.copy()
+    return {name: _plain(goals[name]) for name in goals.dtype.names}

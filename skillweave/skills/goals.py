@@ -7,6 +7,7 @@ A skill with a goal is one policy for many tasks: its networks see the observati
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -138,20 +139,30 @@ def check_reads_goal(skill: Skill, step: Step) -> None:
     Args:
         step: some steps of the skill, with goals.
     """
-    if skill.reward_changes:
-        return
-    watched = _Watched(**{field.name: getattr(step, field.name) for field in fields(Step)})
-    watched.reads = False
-    try:
-        for method in filter(skill.defines, ("reward", "termination", "success")):
-            who = f"skill {path_of(skill)!r}: {method}()"
-            with untouched(skill):  # it leaves no traces
-                call_user(getattr(skill, method), watched, who, judges=None)
-    except SkillweaveError:
-        return  # it is raised where the step is judged
-    if not watched.reads:
+    if not skill.reward_changes and not reads_goal(skill, step):
         notice(
             f"skill {path_of(skill)!r} has goals, but its reward(), termination() and success() "
             "are the same for every goal: none reads step.goal, so the skill learns to ignore its "
             "goal. Let its reward depend on step.goal, or leave out goal_space"
         )
+
+
+JUDGES = ("reward", "termination", "success")
+"""The methods of a skill that judge a step."""
+
+
+def reads_goal(skill: Skill, step: Step, methods: Sequence[str] = JUDGES) -> bool:
+    """Return whether methods of a skill that judge a step read its goal.
+
+    Where one of them fails, it does: that is raised where the step is judged.
+    """
+    watched = _Watched(**{field.name: getattr(step, field.name) for field in fields(Step)})
+    watched.reads = False
+    try:
+        for method in filter(skill.defines, methods):
+            who = f"skill {path_of(skill)!r}: {method}()"
+            with untouched(skill):  # it leaves no traces
+                call_user(getattr(skill, method), watched, who, judges=None)
+    except SkillweaveError:
+        return True
+    return watched.reads

@@ -22,7 +22,8 @@ from skillweave.experience.acting import ActionRepeat, Request
 from skillweave.experience.judges import GoalEnvJudge, SkillJudge
 from skillweave.ops.device import resolve_device
 from skillweave.policies.core import Array
-from skillweave.spaces import to_tensor
+from skillweave.skills.goal_spaces import draw_from
+from skillweave.spaces import action_codec, to_tensor
 from skillweave.training.learner import Stack, acting_of, member_seeds
 from skillweave.training.role import Role
 
@@ -248,21 +249,30 @@ def judge_of(config: Any, role: Role) -> Judge | None:
 
 
 def try_judge(judge: Judge, spec: EnvSpec) -> None:
-    """Judge steps that stand still at the start of two episodes, before steps are spent.
+    """Judge the first steps of two episodes, before steps are spent.
 
     Raises:
         SkillweaveError: what the user has written cannot judge them.
     """
     engine = make_engine(spec, 2)
+    rng = np.random.default_rng(0)
+    codec = action_codec(engine.action_space)
     try:
-        obs = engine.reset(0)
+        obs = np.array(engine.reset(0))
+        action = codec.from_env(draw_from(engine.action_space, 2, rng))
+        if (mask := engine.mask()) is not None:
+            action = codec.allowed_at_random(action, mask, rng)
+        done = codec.to_env(action)
+        step = engine.step(done)
     finally:
         engine.close()
-    columns = {name: np.repeat(x, 2, axis=0) for name, x in judge.examples.items()}
-    rows = RawRows(obs, obs, columns)
-    reached = judge.achieved(obs)
+    known = {"env_action": done, "env_reward": step.reward, "env_terminated": step.terminated}
+    known |= {"env_truncated": step.truncated, "call_elapsed": np.ones(2, np.int64)}
+    columns = {k: known.get(k, np.repeat(x, 2, axis=0)) for k, x in judge.examples.items()}
+    rows = RawRows(obs, np.array(step.next_obs), columns)
+    reached = judge.achieved(rows.next_obs)
     judge.judged(rows, reached)
-    judge.check(rows, reached)
+    judge.check(rows, reached, differ=True)
 
 
 def store_of(
@@ -296,6 +306,7 @@ def store_of(
             codec.zeros(1),
             config.hindsight,
             judge,
+            raw=[name for name in algorithm.raw if name not in judge.examples],
             choices=choices,
             shared=shared,
             device=device,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -273,8 +274,132 @@ def test_goals_that_change_nothing_are_refused(tmp_path):
         def near(self, step: Any) -> Any:
             return step.next_obs[:, 0] > 3
 
-    with pytest.raises(TrainingError, match="neither rewards nor ends are others"):
+    with pytest.raises(DeclarationError, match="are the same for every goal"):
         going(Same).train(tmp_path / "run", quiet=True)
+
+
+class Falls(Bits):
+    """Ends where the first bits are set, of which ``compute_terminated`` knows nothing."""
+
+    late = 200
+
+    def step(self, action: Any) -> Any:
+        seen, paid, _, limit, info = super().step(action)
+        self.late -= 1
+        return seen, paid, self.late < 0 and bool(self.bits[:2].all()), limit, info
+
+    def compute_terminated(self, achieved: Any, desired: Any, info: Any) -> Any:
+        return np.zeros(achieved.shape[:-1], bool)
+
+
+class Differ(Bits):
+    """Achieved and desired goals are of different spaces."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space["desired_goal"] = gym.spaces.MultiBinary(self.size)
+
+
+class Cosine(Bits):
+    """The reward is not a number where the goal is reached."""
+
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        away = np.abs(achieved - desired).sum(axis=-1)
+        with np.errstate(invalid="ignore"):
+            return -away * (away / away)
+
+    def step(self, action: Any) -> Any:
+        return self.see(), 0.0, False, True, {}
+
+
+class Pair(Bits):
+    """The reward comes with something else."""
+
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        return 0.0, {}
+
+    def step(self, action: Any) -> Any:
+        return self.see(), 0.0, False, True, {}
+
+
+@pytest.mark.filterwarnings("ignore:.*does not repeat itself")
+@pytest.mark.parametrize(
+    ("env", "kind", "words"),
+    [
+        (Falls, TrainingError, "the end is another than it was"),
+        (Differ, DeclarationError, "both must have one space"),
+        (Cosine, EnvError, r"compute_reward\(\) returned nan"),
+        (Pair, EnvError, r"compute_reward\(\) returned"),
+    ],
+)
+def test_an_environment_that_judges_oddly_is_told(env, kind, words, tmp_path):
+    config = replace(BITS, learning_starts=60)
+    with pytest.raises(kind, match=words):
+        sw.train_agent(env, config, 2_000, tmp_path / "run", seed=0, quiet=True)
+
+
+class Parts(Bits):
+    """Goals have parts; what is near is set by a reset."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        bits = self.observation_space["observation"]
+        goal = gym.spaces.Dict({"all": bits})
+        parts = {"observation": bits, "achieved_goal": goal, "desired_goal": goal}
+        self.observation_space = gym.spaces.Dict(parts)
+
+    def see(self) -> Any:
+        seen = super().see()
+        return {k: v if k == "observation" else {"all": v} for k, v in seen.items()}
+
+    def reset(self, **how: Any) -> Any:
+        self.near = 0
+        return super().reset(**how)
+
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        pair = (x["all"] if isinstance(x, dict) else x for x in (achieved, desired))
+        return 0.0 - (np.abs(np.subtract(*pair)).sum(axis=-1) > self.near)
+
+    def compute_terminated(self, achieved: Any, desired: Any, info: Any) -> Any:
+        return self.compute_reward(achieved, desired, info) == 0
+
+
+def test_goals_with_parts_reach_the_environment_as_dicts(tmp_path):
+    config = replace(BITS, learning_starts=60, num_envs=2)
+    sw.train_agent(Parts, config, 300, tmp_path / "run", seed=0, quiet=True)
+
+
+@pytest.mark.parametrize("case", ["time", "still"])
+def test_a_legal_reward_is_no_mistake(case, tmp_path):
+    class Legal(GoTo):
+        def near(self, step: Any) -> Any:
+            there = super().near(step)
+            if case == "still":  # it is never true of a policy that has not learnt
+                there &= (step.obs == step.next_obs).all(axis=1)
+            return there
+
+        def reward(self, step: Any) -> Any:
+            return self.near(step) - 1.0 - (case == "time") / step.elapsed
+
+    how = pytest.warns(UserWarning, match="success.. is false in all")
+    with how if case == "still" else nullcontext():
+        algorithm = replace(HER, learning_starts=120)
+        Legal.algorithm = algorithm
+        going(Legal).train(tmp_path / "run", quiet=True)
+
+
+def test_a_choice_that_is_no_goal_is_refused(tmp_path):
+    class Corner(GoTo):
+        goal_space = gym.spaces.Discrete(3)
+
+        def achieved_goal(self, obs: Any) -> Any:
+            return np.full(len(obs), -1)
+
+        def near(self, step: Any) -> Any:
+            return step.goal == 1
+
+    with pytest.raises(sw.errors.SkillError, match=r"gave the goal -1, which is out of goal_space"):
+        going(Corner).train(tmp_path / "run", quiet=True)
 
 
 def test_goals_in_other_units_are_told(tmp_path):
