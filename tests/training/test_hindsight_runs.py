@@ -213,7 +213,7 @@ def test_a_reward_that_has_changed_since_stops_a_resumed_run(tmp_path):
         def reward(self, step: Any) -> Any:
             return 2.0 * self.near(step) - 1.0
 
-    with pytest.raises(TrainingError, match="the reward is another than it was"):
+    with pytest.raises(TrainingError, match="the reward of one is now"):
         going(Other).resume(tmp_path / "run", quiet=True)
 
 
@@ -326,7 +326,7 @@ class Pair(Bits):
 @pytest.mark.parametrize(
     ("env", "kind", "words"),
     [
-        (Falls, TrainingError, "the end is another than it was"),
+        (Falls, TrainingError, "the end of one is now 0, and was 1"),
         (Differ, DeclarationError, "both must have one space"),
         (Cosine, EnvError, r"compute_reward\(\) returned nan"),
         (Pair, EnvError, r"compute_reward\(\) returned"),
