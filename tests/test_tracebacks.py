@@ -111,7 +111,7 @@ def test_ipython_shows_the_users_lines_and_one_sentence(tmp_path):
     shown, _, interrupted = shown.partition("-" * 70)[2].partition("-" * 70)
     *_, last = shown.strip().splitlines()
     assert last.startswith("SkillError: skill 'center': reward() raised IndexError: index")
-    assert last.endswith("(Cell In[1], line 5) at step 1; step.next_obs has the shape (64, 4)")
+    assert last.endswith("(Cell In[1], line 5) at step 1; step.next_obs has the shape (32, 4)")
     assert "skillweave/" not in shown
     assert "direct cause" not in shown
     assert len(shown.splitlines()) < 25

@@ -150,7 +150,10 @@ def test_skills_that_learn_under_a_ready_selector_solve_the_corridor(tmp_path):
     # the door with a third of the seeds; after 24,000 with none of 0 to 11.
     skilled = declare(
         selector=AUTOMATON, learn="together", together_steps=24_000,
-        algorithm=PPO(num_envs=8, n_steps=32, batch_size=64, network=SMALL, learning_rate=3e-3),
+        algorithm=PPO(
+            num_envs=8, n_steps=32, batch_size=64, update_epochs=10, network=SMALL,
+            learning_rate=3e-3,
+        ),
     )  # fmt: skip
     assert skilled.train(tmp_path / "run", seed=0, quiet=True).evaluate(30).mean > 0.9
 
