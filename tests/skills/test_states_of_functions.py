@@ -15,6 +15,7 @@ from gymnasium.spaces import Box, Discrete
 from skillweave import tree
 from skillweave._internal.notices import collected_notices
 from skillweave.errors import DeclarationError, PolicyError, SkillError
+from skillweave.experience.judges import SkillJudge
 from skillweave.planning import GoalTask, Predicate, RewardMachine
 from skillweave.policies.core import LastCall, Turn, World
 from skillweave.policies.spaces import space_of
@@ -228,6 +229,12 @@ def method(name: str):
     return ways.get(name, lambda: call_method(goals.skill, name, about))
 
 
+def achieves():
+    declared = {"achieved_goal": OfObservations.__call__, "goal_space": Box(0, 9, (1,))}
+    judge = SkillJudge(type("Kind", (OfObservations, Skill), declared)(), None, *SPACES)
+    return lambda: judge.achieved(OBS)
+
+
 def places() -> dict[str, list[Callable[[], Any]]]:
     """Return uses of functions of the user, by the modules that call them."""
     never = Predicate(lambda obs: obs[:, 0] > 9)
@@ -240,6 +247,7 @@ def places() -> dict[str, list[Callable[[], Any]]]:
     condition, reflex = Reflex(Best(), 0), Reflex(lambda obs: obs[:, 0] > -1, Best())
     actions = space_of(SPACES[1])
     return {
+        "experience.judges": [achieves()],
         "planning.goal": [lambda: task.holds(OBS, OBS)],
         "planning.predicates": [lambda: inverse.at(OBS)],
         "skills.selector": [
@@ -256,7 +264,7 @@ def places() -> dict[str, list[Callable[[], Any]]]:
             *map(method, Skill.methods),
         ],
         "skills.foreign_policy": [lambda: check_spaces(own, *SPACES, "it", "env")],
-        "skills.goals": [*map(method, Skill.of_goals)],
+        "skills.goals": [method("goals"), method("clip_goal")],
         "skills.scripted": [acts(), acts(sees={"about": slice(0, 1)}), reads(Best())],
     }
 
