@@ -118,9 +118,8 @@ CHAINS: dict[str, tuple[Any, Callable[[bool], list[Skill]], int]] = {
     "locked": (Locked, locked, 250_000),
 }
 """Environment, skills (closed or open) and steps."""
-
-
 LEARNER = PPO(num_envs=64, n_steps=64, batch_size=256, update_epochs=10, learning_rate=1e-3)
+"""The algorithm of skills and selectors."""
 
 
 def score(name: str, way: str, seed: int, out: Path) -> float:

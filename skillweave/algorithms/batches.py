@@ -337,11 +337,6 @@ class RawRows:
     columns: Mapping[str, Array]
     """Raw columns, by name."""
 
-    def some(self, at: Array) -> RawRows:
-        """Return the rows ``at``."""
-        columns = {name: x[at] for name, x in self.columns.items()}
-        return RawRows(self.obs[at], self.next_obs[at], columns)
-
 
 @dataclass(slots=True)
 class Report:

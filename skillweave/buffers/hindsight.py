@@ -124,8 +124,9 @@ class HindsightStore(ReplayStore):
             self._check()
             self._checked = True
         index, _ = self._draw(batch, rngs, beta, first)
-        slot = index % self._columns.slots
-        chance = np.stack([rng.random((2, batch)) for rng in rngs], axis=1)
+        shape = index.shape
+        slot = (index % self._columns.slots).ravel()
+        chance = np.stack([rng.random((2, batch)) for rng in rngs], axis=1).reshape(2, -1)
         rows = self._rows(slot)
         goal = self._judge.goals(rows)
         other = chance[0] < self._how.share
@@ -134,30 +135,32 @@ class HindsightStore(ReplayStore):
             obs = self._columns.data["obs"]
             goal[other] = self._judge.achieved(obs.take(self._columns.after(later), axis=0))
         # All are judged, so that rows with their own goals show where something has changed.
-        every = np.ones(slot.shape, bool)
-        reward, ends = (
-            x.reshape(slot.shape) for x in self._judge.judged(rows.some(every), goal[every])
-        )
+        reward, ends = self._judge.judged(rows, goal)
         self._compare(slot[~other], reward[~other], ends[~other])
         action = self._columns.data["action"].take(slot, axis=0)
-        discount = gamma.float().cpu().numpy()[:, None] * ~ends
+        if action.dtype.kind in "iu":
+            action = action.astype(np.int64)
         env_reward = rows.columns.get("env_reward")
+
+        def tensor(x: Array) -> Tensor:
+            return self._tensor(x.reshape(*shape, *x.shape[1:]))
+
         return Sample(
-            obs=self._tensor(self._judge.seen(rows.obs, goal)),
-            action=self._tensor(action.astype(np.int64) if action.dtype.kind in "iu" else action),
-            reward=self._tensor(reward),
-            discount=self._tensor(discount),
-            next_obs=self._tensor(self._judge.seen(rows.next_obs, goal)),
-            mask=self._mask(slot),
-            next_mask=self._mask(self._columns.after(slot)),
+            obs=tensor(self._judge.seen(rows.obs, goal)),
+            action=tensor(action),
+            reward=tensor(reward),
+            discount=self._tensor(gamma.float().cpu().numpy()[:, None] * ~ends.reshape(shape)),
+            next_obs=tensor(self._judge.seen(rows.next_obs, goal)),
+            mask=self._mask(slot.reshape(shape)),
+            next_mask=self._mask(self._columns.after(slot).reshape(shape)),
             weight=None,
             index=index,
-            env_reward=None if env_reward is None else self._tensor(env_reward),
+            env_reward=None if env_reward is None else tensor(env_reward),
             progress=progress,
         )
 
     def _rows(self, slot: Array) -> RawRows:
-        """Return the raw rows of slots (…)."""
+        """Return the raw rows of slots (k,)."""
         columns = self._columns
         data = columns.data
         raw = {name: data[name].take(slot, axis=0) for name in columns.raw if name in data}

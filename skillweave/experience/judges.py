@@ -71,14 +71,12 @@ class SkillJudge:
         self._part = part
         self._goals = Goals(skill)
         self.observation_space: gym.Space[Any] = observation_space
-        flag = np.zeros(1, bool)
-        number = np.zeros(1, np.float32)
         self.examples: Mapping[str, Array] = {
             "goal": self._goals.start(1),
             "env_action": space_of(action_space).start(1),
-            "env_reward": number,
-            "env_terminated": flag,
-            "env_truncated": flag,
+            "env_reward": np.zeros(1, np.float32),
+            "env_terminated": np.zeros(1, bool),
+            "env_truncated": np.zeros(1, bool),
             "call_elapsed": np.zeros(1, np.int64),
         }
 
@@ -223,9 +221,8 @@ class GoalEnvJudge:
             )
         self._ends = self._method(env, "compute_terminated")
         self._one_by_one: set[str] = set()
-        flag = np.zeros(1, bool)
         self.examples: Mapping[str, Array] = {
-            "env_terminated": flag,
+            "env_terminated": np.zeros(1, bool),
             "call_elapsed": np.zeros(1, np.int64),
         }
 
