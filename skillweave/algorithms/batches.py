@@ -62,6 +62,7 @@ SCHEMA: dict[str, Column] = {
     "env_terminated": _RAW,  # (T, N) bool, the environment's own end
     "env_truncated": _RAW,  # (T, N) bool, the environment's own limit
     "call_elapsed": _RAW,  # (T, N) int64, steps of the call so far
+    "own": _RAW,  # (T, N) bool, rows that the learner made itself, not others of its hierarchy
     # In a trace alone. Under the path of a level (``inner/skill``), of its steps:
     "elapsed": _RAW,  # (T, N) int64, steps so far of the episode, or
     # of the call of a skill that learns apart
@@ -150,6 +151,12 @@ class Batch(Mapping[str, Array]):
         """Rows (T, N) bool of this learner."""
         valid = self.get("valid")
         return np.ones(self.lead, bool) if valid is None else valid
+
+    @property
+    def own_rows(self) -> Array:
+        """Rows (T, N) bool that this learner made itself, and not others of its hierarchy."""
+        own = self.get("own")
+        return self.valid_rows if own is None else self.valid_rows & own
 
     def replace(self, **columns: Array | None) -> Batch:
         """Return a batch with other values of some columns; None removes one."""

@@ -246,6 +246,8 @@ HindsightValue = Annotated[
     ),
 ]
 """Settings of hindsight; True becomes ``Hindsight()``."""
+JUDGES_AGAIN = ("hindsight", "shared_replay")
+"""Settings with which rows are judged again when they are drawn."""
 
 
 @settings
@@ -307,6 +309,9 @@ class OffPolicy:
     hindsight: HindsightValue = False
     """Learn also from goals that were reached instead (HER): True, or ``Hindsight(...)``. For
     skills with goals that define ``achieved_goal``, and agents in environments of goals."""
+    shared_replay: Fraction = 0.0
+    """Share of the samples that other skills of the hierarchy have made (SAC-X, Riedmiller et al.
+    2018), each judged by the skill's own reward and ends; 0: a skill learns from its own steps."""
     threads: Threads = 1
     """Torch threads while learning."""
     compile: bool | Literal["auto"] = False
@@ -333,9 +338,9 @@ class OffPolicy:
             self.buffer_size >= least,
             f"at least {least} (num_envs * (n_step + 1))",
         )
-        if self.hindsight:
-            check(self, "n_step", self.n_step == 1, "1 where hindsight is set")
-            check(self, "prioritized", not self.prioritized, "False where hindsight is set")
+        if judges_again := next((x for x in JUDGES_AGAIN if getattr(self, x)), None):
+            check(self, "n_step", self.n_step == 1, f"1 where {judges_again} is set")
+            check(self, "prioritized", not self.prioritized, f"False where {judges_again} is set")
 
 
 @settings

@@ -163,6 +163,13 @@ class Columns:
         number: Array = slot + laps * self.slots
         return number
 
+    def in_order(self) -> tuple[Array, Array]:
+        """Return the slots (T, N) of all columns in the order of time, and which hold rows."""
+        oldest = np.maximum(0, self.newest - self.rows + 1)
+        place = oldest + np.arange(self.used())[:, None]
+        slot = place % self.rows * self.num_envs + self._column
+        return slot, (place < self.newest) & (self.data["kind"][slot] != NOTHING)
+
     def reward(self, gamma: Array, slot: Array) -> Array:
         """Return rewards of transitions (P, B), float32; of calls Σγᵏrₖ."""
         if "call" not in self.data:

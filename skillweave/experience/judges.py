@@ -1,13 +1,14 @@
-"""Judges of rows from replay: they compute rewards and ends again, under other goals.
+"""Judges of rows from replay: they compute rewards and ends again.
 
 A skill is judged by its own methods, a plain agent by its environment's ``compute_reward``. The
-store that asks them is ``buffers.hindsight.HindsightStore``.
+store that asks them is ``buffers.judged.JudgedStore``.
 """
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NoReturn
 
 import gymnasium as gym
@@ -15,17 +16,20 @@ import numpy as np
 
 from skillweave._internal.messages import error_text, short
 from skillweave._internal.notices import notice
-from skillweave.algorithms.batches import OF_STEP, RawRows
-from skillweave.envs.make import EnvSpec
+from skillweave.algorithms.batches import INFO, OF_STEP, RawRows
+from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError, EnvError, SkillError, TrainingError
-from skillweave.experience.views import learner_obs, step_of
+from skillweave.experience.views import learner_obs, own_actions, step_of
 from skillweave.policies.core import Array, Step, part_of, read_only
 from skillweave.policies.spaces import at, space_of
 from skillweave.skills import Skill, call_method
 from skillweave.skills.base import path_of
-from skillweave.skills.goals import Goals, reads_goal
+from skillweave.skills.goal_spaces import draw_from
+from skillweave.skills.goals import fields_read, goals_of, reads_goal
 from skillweave.skills.outputs import call_user, checked
 from skillweave.skills.own_part import OwnPart
+from skillweave.skills.residual import Residual
+from skillweave.spaces import action_codec, choice_counts
 
 ACHIEVED, DESIRED = "achieved_goal", "desired_goal"
 """Parts of the observations of an environment of goals."""
@@ -34,13 +38,16 @@ MANY = 100
 
 
 class SkillJudge:
-    """The judge of a skill with goals.
+    """The judge of a skill, under other goals and of other skills' steps.
 
     Args:
-        part: of observations that it sees; None: all.
+        part: of observations and actions that it has; None: all.
+        hindsight: it is judged under goals that were reached.
+        shared: it is judged in other skills' steps: the keys of ``info`` that are stored with them,
+            with an example (1, …); None: in its own steps alone.
 
     Raises:
-        DeclarationError: the skill has no goals, or does not say what it has reached.
+        DeclarationError: the skill cannot be judged so.
     """
 
     def __init__(
@@ -49,40 +56,70 @@ class SkillJudge:
         part: OwnPart | None,
         observation_space: gym.Space[Any],
         action_space: gym.Space[Any],
+        *,
+        hindsight: bool = True,
+        shared: Mapping[str, Array] | None = None,
     ) -> None:
         self.who = f"skill {path_of(skill)!r}"
-        if skill.goal_space is None:
+        why = f"{self.who}: its algorithm has {'hindsight' if hindsight else 'shared_replay'}"
+        if hindsight and skill.goal_space is None:
             raise DeclarationError(
-                f"{self.who}: its algorithm has hindsight, but it has no goals: set goal_space, or "
-                "give it an algorithm of its own without hindsight"
+                f"{why}, but it has no goals: set goal_space, or give it an algorithm of its own "
+                "without hindsight"
             )
-        if not skill.defines("achieved_goal"):
+        if hindsight and not skill.defines("achieved_goal"):
             raise DeclarationError(
-                f"{self.who}: its algorithm has hindsight, but it does not say what it reaches: "
-                "define achieved_goal(self, obs), which returns the goals that are reached in obs, "
-                "(n, *goal_shape)"
+                f"{why}, but it does not say what it reaches: define achieved_goal(self, obs), "
+                "which returns the goals that are reached in obs, (n, *goal_shape)"
             )
         if skill.reward_changes:
             raise DeclarationError(
-                f"{self.who}: its algorithm has hindsight, which computes rewards of past steps "
-                "again, but reward_changes says that they would be others"
+                f"{why}, which computes rewards of past steps again, but reward_changes says that "
+                "they would be others"
+            )
+        if shared is not None and isinstance(skill.policy, Residual):
+            raise DeclarationError(
+                f"{self.who}: its algorithm has shared_replay, but its actions are added to those "
+                "of another policy (Residual), which other skills' actions are not: leave out "
+                "shared_replay"
             )
         self._skill = skill
         self._part = part
-        self._goals = Goals(skill)
+        self._goals = goals_of(skill)
+        self._keys = () if hindsight else tuple(shared or ())
+        self._no_info = (
+            f"{why}, which judges past steps again, but reads {{}}, which may be another one under "
+            "another goal: compute it from step.next_obs"
+        )
+        if not hindsight:
+            self._no_info = (
+                f"{why}, which stores what it reads of info in the first step, but later it reads "
+                "{}, too: read it in each step, or compute it from step.next_obs"
+            )
+        own_space = action_space if part is None else part.action_space
+        self._codec = action_codec(own_space)
         self.observation_space: gym.Space[Any] = observation_space
-        self.examples: Mapping[str, Array] = {
-            "goal": self._goals.start(1),
+        self.choices = sum(choice_counts(action_space))
+        examples: dict[str, Array] = {
             "env_action": space_of(action_space).start(1),
             "env_reward": np.zeros(1, np.float32),
             "env_terminated": np.zeros(1, bool),
             "env_truncated": np.zeros(1, bool),
             "call_elapsed": np.zeros(1, np.int64),
         }
+        if self._goals is not None:
+            examples["goal"] = self._goals.start(1)
+        examples |= {INFO + key: value for key, value in (shared or {}).items()}
+        self.examples: Mapping[str, Array] = examples
 
-    def goals(self, rows: RawRows) -> Array:
-        """Return the goals that rows (…) had."""
-        return rows.columns["goal"].copy()
+    def goals(self, rows: RawRows) -> Array | None:
+        """Return the goals that rows (…) had; None: it has none."""
+        return None if self._goals is None else rows.columns["goal"].copy()
+
+    def practised(self, obs: Array, rng: np.random.Generator) -> Array:
+        """Return goals to practise in observations (k, …), by the skill's ``goals``."""
+        assert self._goals is not None
+        return self._goals.draw(obs, rng)
 
     def achieved(self, obs: Array) -> Array:
         """Return the goals that observations (k, …) have reached.
@@ -92,6 +129,7 @@ class SkillJudge:
         """
         who = f"{self.who}: achieved_goal()"
         given = call_user(self._skill.achieved_goal, read_only(obs), who)
+        assert self._goals is not None
         space = self._goals.space
         goals = space.goals(given, len(obs), who, self.who)
         for path, leaf in space.leaves.items():
@@ -105,14 +143,26 @@ class SkillJudge:
                 raise SkillError(space.is_out(goals[wrong][0], who, self.who))
         return goals
 
-    def judged(self, rows: RawRows, goal: Array) -> tuple[Array, Array]:
+    def judged(self, rows: RawRows, goal: Array | None) -> tuple[Array, Array]:
         """Return the skill's rewards, and its and the environment's ends."""
         step = self._step(rows, goal)
-        ids = np.arange(len(goal))
+        ids = np.arange(len(step.reward))
         ends = rows.columns["env_terminated"]
         if self._skill.defines("termination"):
             ends = ends | call_method(self._skill, "termination", step, ids)
         return call_method(self._skill, "reward", step, ids), ends
+
+    def check_shared(self, rows: RawRows, goal: Array | None) -> None:
+        """Raise a DeclarationError where steps of others cannot be judged by the skill."""
+        step = self._step(rows, goal)
+        for method in ("reward", "termination"):
+            read = fields_read(self._skill, step, (method,)) or set()
+            if found := sorted(read & {"elapsed", "timed_out"}):
+                raise DeclarationError(
+                    f"{self.who}: its algorithm has shared_replay, but {method}() reads "
+                    f"step.{found[0]}, the time of its own call, which steps of other skills do "
+                    "not have: let it depend on what step.obs, action and next_obs show"
+                )
 
     def check(self, rows: RawRows, goal: Array, *, differ: bool) -> None:
         """Raise an error where the skill's success reads ``info``, or nothing reads the goal.
@@ -134,6 +184,7 @@ class SkillJudge:
                 f"{self.who}: its algorithm has hindsight, but its reward() and termination() are "
                 "the same for every goal: let them depend on step.goal, or leave out hindsight"
             )
+        assert self._goals is not None
         if many and not self._goals.space.holds(goal).any():
             notice(
                 f"{self.who}: none of the {len(goal):,} goals that achieved_goal() says were "
@@ -141,46 +192,134 @@ class SkillJudge:
                 f"{short(self._skill.goal_space)}): are they in the same units?"
             )
 
-    def seen(self, obs: Array, goal: Array) -> Array:
+    def seen(self, obs: Array, goal: Array | None) -> Array:
         """Return observations (…) as the skill's networks see them."""
         return learner_obs(obs, goal, self._goals, self._part)
 
-    def _step(self, rows: RawRows, goal: Array) -> Step:
+    def mask(self, mask: Array | None) -> Array | None:
+        """Return the skill's part of the environment's action masks (…, A)."""
+        return mask if self._part is None else self._part.part.mask(mask)
+
+    def action(self, env_action: Array) -> tuple[Array, Array]:
+        """Return the environment's actions (k, …) as the skill's, and which it could have done."""
+        return own_actions(env_action, self._part, self._codec)
+
+    def _step(self, rows: RawRows, goal: Array | None) -> Step:
         columns = {"obs": rows.obs, "next_obs": rows.next_obs, **rows.columns}
         elapsed = columns["call_elapsed"]
-        info = _NoInfo(self.who)
+        stored = {key: columns[INFO + key] for key in self._keys}
+        info = _StoredInfo(stored, self._no_info)
         step = step_of({name: columns[name] for name in OF_STEP}, elapsed, info)
         return part_of(step, elapsed, None, self._skill.max_steps, goal)
 
 
-class _NoInfo(Mapping[str, Any]):
-    """The info of rows that are judged again: it was not stored."""
+class _StoredInfo(Mapping[str, Any]):
+    """The info of rows that are judged again: a few keys are stored, others are refused.
 
-    def __init__(self, who: str) -> None:
-        self._who = who
+    Args:
+        stored: numbers (k, …) by key.
+        refusal: the message about another key, which stands in it as {}.
+    """
 
-    def _refuse(self, key: object) -> NoReturn:
-        raise DeclarationError(
-            f"{self._who}: its algorithm has hindsight, which judges past steps again, but reads "
-            f"info[{key!r}], which may be another one under another goal: compute it from "
-            "step.next_obs"
-        )
+    def __init__(self, stored: Mapping[str, Array], refusal: str) -> None:
+        self._stored = stored
+        self._refusal = refusal
 
     def __getitem__(self, key: str) -> Any:
-        self._refuse(key)
+        if key not in self._stored:
+            self._refuse(key)
+        return self._stored[key]
 
     def get(self, key: str, default: Any = None) -> Any:
-        """Raise a DeclarationError that names the key."""
-        self._refuse(key)
+        """Return a stored key; raise a DeclarationError that names another one."""
+        return self[key]
 
     def __contains__(self, key: object) -> bool:
-        self._refuse(key)
+        if key not in self._stored:
+            self._refuse(key)
+        return True
 
     def __iter__(self) -> Iterator[str]:
         self._refuse("any key")
 
     def __len__(self) -> int:
-        return 0
+        return len(self._stored)
+
+    def _refuse(self, key: object) -> NoReturn:
+        raise DeclarationError(self._refusal.format(f"info[{key!r}]"))
+
+
+class _NotedInfo(Mapping[str, Any]):
+    """The info of a step, which notes which keys are read."""
+
+    def __init__(self, info: Mapping[str, Any]) -> None:
+        self._info = info
+        self.keys_so_far = getattr(info, "keys_so_far", None)
+        self.read: dict[str, None] = {}
+
+    def __getitem__(self, key: str) -> Any:
+        self.read[key] = None
+        return self._info[key]
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return a key, and note it; the default where no environment has given it."""
+        self.read[key] = None
+        return self._info.get(key, default)
+
+    def __contains__(self, key: object) -> bool:
+        self.read[str(key)] = None
+        return key in self._info
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._info)
+
+    def __len__(self) -> int:
+        return len(self._info)
+
+
+def first_step(spec: EnvSpec) -> Step:
+    """Return the first step of two episodes, with actions at random."""
+    engine = make_engine(spec, 2)
+    rng = np.random.default_rng(0)
+    codec = action_codec(engine.action_space)
+    try:
+        obs = np.array(engine.reset(0))
+        action = codec.from_env(draw_from(engine.action_space, 2, rng))
+        if (mask := engine.mask()) is not None:
+            action = codec.allowed_at_random(action, mask, rng)
+        done = codec.to_env(action)
+        step = engine.step(done).seen(obs, done, np.ones(2, np.int64))
+        return replace(step, next_obs=np.array(step.next_obs))
+    finally:
+        engine.close()
+
+
+def info_read(spec: EnvSpec, skills: Sequence[Skill]) -> dict[str, Array]:
+    """Return the keys of ``info`` that rewards and ends of skills read, with an example (1, …).
+
+    Raises:
+        DeclarationError: a key is no number of each environment, or is not always there.
+        SkillError: a skill's method failed.
+    """
+    step = first_step(spec)
+    found: dict[str, Array] = {}
+    for skill in skills:
+        info = _NotedInfo(step.info)
+        goals = goals_of(skill)
+        goal = None if goals is None else goals.draw(step.obs, np.random.default_rng(0))
+        seen = part_of(replace(step, info=info), step.elapsed, None, skill.max_steps, goal)
+        for method in filter(skill.defines, ("reward", "termination")):
+            call_method(skill, method, seen)
+        for key in info.read:
+            value = np.asarray(step.info[key] if key in step.info else None)
+            if value.dtype.kind not in "biuf" or value.shape[:1] != (2,):
+                raise DeclarationError(
+                    f"skill {path_of(skill)!r}: its algorithm has shared_replay, which stores what "
+                    f"it reads of info with each step, but info[{key!r}] is {short(step.info.get(key))} "
+                    "after the first step; a number for each environment is needed in each step"
+                )
+            found[key] = value[:1]
+    return found
 
 
 class GoalEnvJudge:
@@ -225,6 +364,7 @@ class GoalEnvJudge:
             "env_terminated": np.zeros(1, bool),
             "call_elapsed": np.zeros(1, np.int64),
         }
+        self.choices = sum(choice_counts(spec.spaces.action))
 
     @staticmethod
     def _method(env: gym.Env[Any, Any], name: str) -> Any:
@@ -232,15 +372,21 @@ class GoalEnvJudge:
 
     def goals(self, rows: RawRows) -> Array:
         """Return the goals that rows (…) had, as they were seen before the steps."""
-        return rows.obs[DESIRED].copy()
+        desired: Array = rows.obs[DESIRED].copy()
+        return desired
+
+    def practised(self, obs: Array, rng: np.random.Generator) -> Array:
+        """Raise an error: an environment draws its goals itself, and shares no steps."""
+        raise NotImplementedError
 
     def achieved(self, obs: Array) -> Array:
         """Return the goals that observations (k,) have reached."""
         reached: Array = obs[ACHIEVED]
         return reached
 
-    def judged(self, rows: RawRows, goal: Array) -> tuple[Array, Array]:
+    def judged(self, rows: RawRows, goal: Array | None) -> tuple[Array, Array]:
         """Return the environment's rewards and ends."""
+        assert goal is not None
         reached = rows.next_obs[ACHIEVED]
         reward = self._answers("compute_reward", self._reward, reached, goal, np.float32)
         if self._ends is not None:
@@ -263,11 +409,19 @@ class GoalEnvJudge:
                 "does it depend on the goal?"
             )
 
-    def seen(self, obs: Array, goal: Array) -> Array:
+    def seen(self, obs: Array, goal: Array | None) -> Array:
         """Return observations (…) with these goals as ``desired_goal``."""
         obs = obs.copy()
         obs[DESIRED] = goal
         return obs
+
+    def mask(self, mask: Array | None) -> Array | None:
+        """Return the environment's action masks as they are."""
+        return mask
+
+    def action(self, env_action: Array) -> tuple[Array, Array]:
+        """Raise an error: an agent has no other skills' steps."""
+        raise NotImplementedError
 
     def _answers(self, name: str, method: Any, reached: Array, goal: Array, kind: Any) -> Array:
         """Return a method's answers (k,), of all pairs at once if it takes them so."""

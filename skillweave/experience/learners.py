@@ -20,7 +20,13 @@ from skillweave.experience.acting import Acting, Request
 from skillweave.experience.decisions import OpenCalls
 from skillweave.experience.levels import LearningLevel, own_memory, with_learners
 from skillweave.experience.search import Starts
-from skillweave.experience.views import OwnSteps, call_successes, info_numbers_of, rows_of
+from skillweave.experience.views import (
+    OwnSteps,
+    call_successes,
+    info_numbers_of,
+    rows_of,
+    with_others,
+)
 from skillweave.experience.writer import TraceWriter
 from skillweave.policies.core import EPISODE, LIMIT, RUNNING, Array, RowPolicy, end_with_episode
 from skillweave.policies.hierarchy import ActiveGuide
@@ -109,8 +115,8 @@ class OneLearner:
         self._before = None if self._state is None else (self._state.copy(), elapsed == 0)
 
     def reads_infos(self) -> bool:
-        """Return whether a skill below is judged by ``info``."""
-        return False
+        """Return whether a skill below is judged by ``info``, or it is recorded."""
+        return any(name.startswith(INFO) for name in self._record)
 
     def write(self, out: TraceWriter, end: Array, whole: bool) -> None:
         """Go on to the next row; see ``LevelLearners.write``."""
@@ -126,6 +132,7 @@ class OneLearner:
         goes_on = steps["valid"] & ~steps.ended
         steps = steps.replace(valid=trace.get("valid"))
         calls = {"call_end": trace["end"], "call_elapsed": trace["elapsed"]}
+        calls["own"] = np.ones(trace.lead, bool)
         batch = rows_of(trace, steps, "", self._record, self._goals, self._part, calls)
         return {"": _completed(batch, self._space, self._before, goes_on)}
 
@@ -218,9 +225,10 @@ class LevelLearners:
                     yield path, (rnn.copy(), ~acted[path + "/"])
 
     def reads_infos(self) -> bool:
-        """Return whether a skill below is judged by ``info``."""
+        """Return whether a skill below is judged by ``info``, or it is recorded."""
         judges = [level.skills[i] for level in self.levels for i in (*level.learning, *level.below)]
-        return any(s.defines(method) for s in judges for method in ("reward", "termination"))
+        judged = any(s.defines(method) for s in judges for method in ("reward", "termination"))
+        return judged or any(x.startswith(INFO) for names in self._records.values() for x in names)
 
     def write(self, out: TraceWriter, end: Array, whole: bool) -> None:
         """Write into the trace which calls run after a step, and why others ended.
@@ -292,7 +300,8 @@ class LevelLearners:
         for i, skill in enumerate(level.skills):
             acts = steps["valid"] & (trace[level.path + "skill"] == i)
             if i in level.learning:
-                yield level.path + skill.name, self._of_skill(trace, level, i, acts, end)
+                path = level.path + skill.name
+                yield path, self._of_skill(trace, level, i, acts, end, steps["valid"])
             elif i in level.below:
                 yield from self._of_level(trace, *self._inside(trace, level, i, acts, end))
 
@@ -316,9 +325,15 @@ class LevelLearners:
         )
 
     def _of_skill(
-        self, trace: Trace, level: LearningLevel, i: int, acts: Array, end: Array
+        self, trace: Trace, level: LearningLevel, i: int, acts: Array, end: Array, others: Array
     ) -> Batch:
-        """Return the rows of a skill that learns, judged by its own reward and ends."""
+        """Return the rows of a skill that learns, judged by its own reward and ends.
+
+        Args:
+            acts: (T, N) bool, where it acts.
+            end: see ``_of_level``.
+            others: (T, N) bool, where it or another skill of its level acts.
+        """
         skill = level.skills[i]
         part = level.skill_set.part(i)
         goals = level.hierarchy.goals.get(i)
@@ -335,7 +350,10 @@ class LevelLearners:
         record = self._records[path]
         batch = rows_of(trace, steps, f"{path}/", record, goals, part, calls)
         space = self._space if part is None else part.action_space
-        return _completed(batch, space, self._states.get(path), acts & ~trace.ended)
+        batch = _completed(batch, space, self._states.get(path), acts & ~trace.ended)
+        if "own" not in record:
+            return batch
+        return with_others(batch, trace, others, end, part, action_codec(space))
 
     @staticmethod
     def _inside(

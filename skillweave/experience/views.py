@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from skillweave._internal.messages import short
-from skillweave.algorithms.batches import OF_STEP, Batch, Trace
+from skillweave.algorithms.batches import INFO, OF_STEP, Batch, Trace
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.policies.core import OWN, RUNNING, Array, Step, own_step, part_of
 from skillweave.policies.infos import Infos
@@ -22,6 +22,7 @@ from skillweave.skills.goals import Goals, check_reads_goal
 from skillweave.skills.outputs import missing_key
 from skillweave.skills.own_part import OwnPart
 from skillweave.skills.probing import first_time
+from skillweave.spaces import ActionCodec
 
 AT_ONCE = 1 << 26
 """Bytes of observations that a skill judges at once."""
@@ -205,22 +206,77 @@ def rows_of(
     Args:
         path: before the names of the learner's own columns: empty, or ``inner/up/``.
         record: names of raw columns. With ``call_end`` among them, rows are to be judged again:
-            observations are the environment's, without a goal.
+            observations and masks are the environment's, without a goal.
         goals: of the learner's skill: it observes them, too.
         part: of observations and actions that the learner's skill has; None: it has all.
         of_call: raw columns of the learner's calls.
     """
     columns = {**trace, **(of_call or {})}
     found = {k: columns.get(k) for k in ("mask", "next_mask", "overridden", *record)}
-    if part is not None:
-        found |= {k: part.part.mask(found[k]) for k in ("mask", "next_mask")}
     goal = None if goals is None else trace[path + "goal"]
     if "call_end" in record:
         found |= {"obs": trace["obs"], "next_obs": trace["next_obs"], "goal": goal}
+        keys = (name for name in record if name.startswith(INFO))
+        found |= {name: info_numbers_of(trace, name.removeprefix(INFO)) for name in keys}
     else:
         found |= {k: learner_obs(trace[k], goal, goals, part) for k in ("obs", "next_obs")}
+        if part is not None:
+            found |= {k: part.part.mask(found[k]) for k in ("mask", "next_mask")}
     found |= {k: trace.get(path + k) for k in ("action", "dist_params")}
     return steps.replace(**found, steps=np.ones(trace.lead, np.int64))
+
+
+def own_actions(env_action: Array, part: OwnPart | None, codec: ActionCodec) -> tuple[Array, Array]:
+    """Return the environment's actions (k, …) in policy units of a skill.
+
+    Returns:
+        The skill's part of each, and where it could have acted so: it leaves the rest of the action
+        as it was, or has the choice that was made, (k,) bool.
+    """
+    possible = np.ones(len(env_action), bool)
+    if part is not None:
+        mine = part.part.read(env_action)
+        same = part.part.write(mine, env_action) == env_action
+        possible = same.reshape(len(same), -1).all(axis=1)
+        env_action = mine
+    return codec.from_env(env_action), possible
+
+
+def with_others(
+    rows: Batch, trace: Trace, acts: Array, end: Array, part: OwnPart | None, codec: ActionCodec
+) -> Batch:
+    """Return a skill's rows with those of others beside them, which its own judge may judge later.
+
+    Args:
+        rows: of the skill, with raw columns; it is ``valid`` where it acts.
+        acts: (T, N) bool, where the skill or others act.
+        end: (T, N) int8, why calls ended after the step.
+        part: of actions that the skill has; None: all.
+        codec: of the skill's actions.
+    """
+    own = rows["valid"]
+    others = acts & ~own
+    env_action = trace["env_action"]
+    flat = env_action.reshape(-1, *env_action.shape[2:])
+    action, possible = own_actions(flat, part, codec)
+    action = action.reshape(rows["action"].shape)
+    possible = possible.reshape(own.shape)
+    valid = own | (others & possible)
+    terminated = rows["terminated"] | (valid & others & trace["env_terminated"])
+    truncated = valid & (end != RUNNING)
+    truncated[:-1] &= trace.ended[:-1]
+    truncated[:-1] |= valid[:-1] & ~valid[1:]
+    if part is not None:  # the next step may be one that the skill could not have made
+        truncated[-1] |= valid[-1] & others[-1]
+    at = own.reshape(*own.shape, *[1] * (action.ndim - 2))
+    return rows.replace(
+        action=np.where(at, rows["action"], action),
+        terminated=terminated,
+        truncated=truncated & ~terminated,
+        valid=valid,
+        call_end=np.where(acts, end, RUNNING),
+        own=own,
+    )
 
 
 def learner_obs(obs: Array, goal: Any, goals: Goals | None, part: OwnPart | None) -> Array:

@@ -167,13 +167,24 @@ class Level(LimitedCalls, Settings):
     def role_of_skill(self, path: str, spec: EnvSpec) -> Role:
         """Return the role of one of its skills, in the environment ``spec``."""
         skill = self.skills[path]
+        config = self._config_of_skill(path)
+        greedy = self.selection.greedy_skills is not False
+        sharing: tuple[Skill, ...] = ()
+        if _shares(config):
+            sharing = tuple(s for p, s in self.skills.items() if _shares(self._config_of_skill(p)))
+        return Role(
+            path, "skill", spec, config, skill, greedy=greedy, rest=self.rest, sharing=sharing
+        )
+
+    def _config_of_skill(self, path: str) -> AlgorithmConfig | None:
+        """Return the algorithm that a skill learns by; None: it is ready, or a hierarchy."""
+        skill = self.skills[path]
         config = None
         if is_trained(skill):
             config = skill.algorithm or self.algorithm
         if isinstance(skill.policy, Learnable):
             config = skill.policy.learning_on(config, f"skill {path!r}")
-        greedy = self.selection.greedy_skills is not False
-        return Role(path, "skill", spec, config, skill, greedy=greedy, rest=self.rest)
+        return config
 
     def deciding_roles(self, spec: EnvSpec) -> tuple[Role, Role]:
         """Return the roles of its selector and of its critic, in the environment ``spec``."""
@@ -209,6 +220,11 @@ class Level(LimitedCalls, Settings):
         if isinstance(self.call_steps, Lengths):
             return round(sum(self.lengths) / len(self.lengths))
         return self.call_steps or CALL
+
+
+def _shares(config: AlgorithmConfig | None) -> bool:
+    """Return whether a skill with this algorithm learns from other skills' steps."""
+    return bool(getattr(config, "shared_replay", 0.0))
 
 
 @dataclass(frozen=True)

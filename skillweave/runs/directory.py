@@ -9,6 +9,7 @@ checkpoint.safetensors       the latest checkpoint of the stage in training (and
 calls.safetensors            calls of the skills (``planning/run_log.py``)
 policies/<stage>.safetensors policies of finished stages
 states/<name>.safetensors    states of learners that continue in a later stage, until that is done
+replay/<skill>.safetensors   steps of a skill that shares its replay, until the next one is done
 starts/<name>.safetensors    initial policies from another run, until their learner's stage is done
 starts/<stage>.safetensors   observations of a repair's rehearsal, until the repair is done
 final/<stage>.safetensors    final states, from which finished stages can train for more steps
@@ -34,6 +35,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from skillweave._internal.messages import absolute, shown_path
+from skillweave._internal.paths import level_of
 from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy, state_from
 from skillweave.errors import DeclarationError, RunError
 from skillweave.policies.untrusted import shown
@@ -76,6 +78,8 @@ CALLS_LOCK = ".calls.lock"
 """The file that a process locks while it adds calls."""
 FINAL = "final"
 """The folder of final states."""
+REPLAY = "replay"
+"""The folder of steps of skills that share them."""
 LINES = ("metrics_bytes", "lineage_bytes")
 """Fields of headers and of the manifest: sizes of the files of lines."""
 
@@ -443,11 +447,50 @@ class RunDirectory:
             return None
         return state_from(tensors, like, str(path))
 
+    def sharing_stages(self, like: StageEntry) -> tuple[list[StageEntry], list[StageEntry]]:
+        """Return the stages before and after one in which a skill of its level shares its steps."""
+        stages = self.manifest.stages
+        at = [entry.name for entry in stages].index(like.name)
+        before, after = (
+            [x for x in part if x.shares and level_of(x.name) == level_of(like.name)]
+            for part in (stages[:at], stages[at + 1 :])
+        )
+        return before, after
+
+    def save_rows(self, entry: StageEntry, rows: Callable[[], Mapping[str, Tensor]]) -> None:
+        """Write the rows of a stage's learner, if a later stage begins with them."""
+        if entry.shares and any(not x.done for x in self.sharing_stages(entry)[1]):
+            self.write(REPLAY, entry.name, rows(), {}, entry.name)
+
+    def load_rows(self, entry: StageEntry) -> dict[str, Tensor] | None:
+        """Return the rows with which a stage's learner begins; None: there are none.
+
+        Raises:
+            RunError: the file is missing or damaged, or belongs to another run.
+        """
+        before = self.sharing_stages(entry)[0] if entry.shares else []
+        if not before or entry.name not in entry.learns:
+            return None
+        path = self.file(REPLAY, before[-1].name)
+        if not path.exists():
+            raise RunError(
+                f"{path} is not there any more: skill {entry.name!r} would learn from these steps "
+                f"of {before[-1].name!r} (shared_replay); begin a new run"
+            )
+        tensors, header = read_tensors(path, most=None)
+        self.must_be_ours(header.get("run"), path)
+        return tensors
+
     def drop_used(self, entry: StageEntry) -> None:
         """Remove the files of a finished stage that no later stage needs.
 
-        They are initial policies, the observations of a rehearsal, and final states of learners.
+        They are initial policies, the observations of a rehearsal, steps that are shared, and final
+        states of learners.
         """
+        if entry.shares:
+            before, _ = self.sharing_stages(entry)
+            for earlier in before:
+                self.remove(REPLAY, earlier.name)
         for name in entry.learns:
             if not self.learns_again(entry.name, name):
                 self.remove("states", name)
@@ -628,7 +671,7 @@ def _clear_run(run: RunDirectory) -> None:
     """
     remove(run.path / "run.json")  # first: without it, the other files have no meaning
     for entry in list(run.path.iterdir()):
-        if entry.name in (*FOLDERS, "states", FINAL, "plots") and entry.is_dir():
+        if entry.name in (*FOLDERS, "states", REPLAY, FINAL, "plots") and entry.is_dir():
             for inner in (*sorted(entry.rglob("*"), reverse=True), entry):
                 if inner.is_file() and _fits(inner, (*IN_FOLDERS, *_copies(run))):
                     remove(inner)

@@ -331,6 +331,12 @@ class StageEntry:
         return self.status == "done"
 
     @property
+    def shares(self) -> bool:
+        """True if a skill learns apart here from its own steps and those of earlier ones."""
+        alone = self.kind == "skill" and self.evolution is None and self.repair is None
+        return alone and bool(self.algorithm.get("shared_replay"))
+
+    @property
     def members(self) -> int:
         """The number of members of its population; 1 without one."""
         return 1 if self.evolution is None else int(self.evolution["population"])

@@ -39,7 +39,7 @@ from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Loop, LoopState, Saved
 from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 from skillweave.training.rehearsal import rehearse
-from skillweave.training.replay_learner import judge_of
+from skillweave.training.replay_learner import ReplayLearner, judge_of
 from skillweave.training.stack_learner import learner_of
 from skillweave.training.stage import Together
 from skillweave.training.stage_log import StageLog, resumed, success_rate
@@ -198,6 +198,10 @@ class Agents:
             goes_on_at=self.log.at.steps,
             judge=judge_of(algorithm.config, self.roles[name]),
         )
+        if isinstance(learner, ReplayLearner) and not tensors:
+            rows = self.stage.run.load_rows(self.entry)
+            if rows is not None:
+                learner.begin_with(rows)
         if isinstance(learner, RolloutLearner):
             learner.reference = reference
             first = name == self.entry.decides
@@ -333,6 +337,8 @@ class Agents:
                 log.report_learnt_nothing()
         log.report_episodes(self.loop.episodes.tally, over=True)
         self.collectors.finish()
+        if isinstance(self.learner, ReplayLearner):
+            self.stage.run.save_rows(self.entry, self.learner.shared_rows)
         if (best := self.best.found) is not None:
             for path, stack in self.stacks().items():
                 stack.state = state_to(self.best.states[path], stack.state.params.device)

@@ -81,7 +81,7 @@ class JointLearner:
                 if weight:
                     by_learner[name] = by_learner[name].replace(advantage=weight * advantage)
         for name, rows in by_learner.items():
-            self.counts[name][0] += int(rows.valid_rows.sum())
+            self.counts[name][0] += int(rows.own_rows.sum())
             self._acted |= prefixed(name, how_it_acted(name, rows))
             self.learners[name].take({"": rows})
 
@@ -141,7 +141,7 @@ def how_it_acted(name: str, rows: Batch) -> dict[str, Tensor]:
         ``call_length``, or ``usage`` (a share of all steps) and ``reward`` (mean of its own
         steps), each (1,).
     """
-    valid = rows.valid_rows
+    valid = rows.own_rows
     metrics: dict[str, float] = {}
     if name_of(name) == SELECTOR:
         if valid.any():

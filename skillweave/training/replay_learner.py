@@ -13,17 +13,17 @@ from torch import Tensor
 from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams
-from skillweave.algorithms.batches import Batch, RawRows
-from skillweave.buffers.hindsight import HindsightStore, Judge
+from skillweave.algorithms.batches import OF_STEP, Batch, RawRows
+from skillweave.algorithms.config import JUDGES_AGAIN
+from skillweave.buffers.judged import Judge, JudgedStore
 from skillweave.buffers.replay import ReplayStore
-from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.experience.acting import ActionRepeat, Request
-from skillweave.experience.judges import GoalEnvJudge, SkillJudge
+from skillweave.experience.judges import GoalEnvJudge, SkillJudge, first_step
 from skillweave.ops.device import resolve_device
 from skillweave.policies.core import Array
-from skillweave.skills.goal_spaces import draw_from
-from skillweave.spaces import action_codec, to_tensor
+from skillweave.spaces import to_tensor
 from skillweave.training.learner import Stack, acting_of, member_seeds
 from skillweave.training.role import Role
 
@@ -111,10 +111,24 @@ class ReplayLearner:
         """Store rows, and update the running scales of observations and returns."""
         batch = batches[""]
         self.store.add(batch)
-        valid = batch.get("valid")
-        count = batch["reward"].size if valid is None else int(valid.sum())
-        obs = self.store.seen(batch)
-        self._transitions[1] += count / self.members
+        self._transitions[1] += int(batch.own_rows.sum()) / self.members
+        self._see(self.store.seen(batch), batch.get("valid"))
+        if any(s.algorithm.scales_rewards for s in self.stacks):
+            self._scale_returns(batch)
+
+    def shared_rows(self) -> dict[str, Tensor]:
+        """Return the rows with which the next skill begins."""
+        assert isinstance(self.store, JudgedStore)
+        return self.store.shared_rows()
+
+    def begin_with(self, shared: Mapping[str, Tensor]) -> None:
+        """Begin with the rows of another skill's store, see ``JudgedStore``."""
+        assert isinstance(self.store, JudgedStore)
+        for obs, valid in self.store.begin_with(shared):
+            self._see(obs, valid)
+
+    def _see(self, obs: Array, valid: Array | None) -> None:
+        """Update the running scales of observations (T, N, …) that are to be learnt from."""
         for i, stack in enumerate(self.stacks):
             columns = self._columns(i)
             stack.algorithm.update_obs_stats(
@@ -122,8 +136,6 @@ class ReplayLearner:
                 _rows(obs, columns, stack),
                 None if valid is None else _rows(valid, columns, stack),
             )
-        if any(s.algorithm.scales_rewards for s in self.stacks):
-            self._scale_returns(batch)
 
     def _scale_returns(self, batch: Batch) -> None:
         """Update the running scale of discounted returns, row by row."""
@@ -132,7 +144,7 @@ class ReplayLearner:
         if self._returns is None:
             self._returns = np.zeros(n, np.float32)
         gamma = self._gamma().repeat(each)
-        all_valid = batch.get("valid")
+        all_valid = batch.own_rows if "own" in batch else batch.get("valid")
         for at, ended in enumerate(batch.ended):
             valid = None if all_valid is None else all_valid[at]
             power = gamma ** batch["steps"][at].astype(np.float32)
@@ -230,49 +242,61 @@ class ReplayLearner:
 
 
 def judge_of(config: Any, role: Role) -> Judge | None:
-    """Return who judges a learner's rows under other goals; None: nobody, without hindsight.
+    """Return who judges a learner's rows again; None: nobody, see ``JUDGES_AGAIN``.
 
     Raises:
-        DeclarationError: the learner cannot have hindsight.
+        SkillweaveError: the learner's rows cannot be judged again.
     """
-    if not getattr(config, "hindsight", False):
+    setting = next((x for x in JUDGES_AGAIN if getattr(config, x, False)), None)
+    if setting is None:
         return None
     spaces = role.spec.spaces
+    if role.kind == "agent" and config.shared_replay:
+        raise DeclarationError(
+            "a plain agent has no skills beside it that could share their steps: leave out "
+            "shared_replay, or train a Hierarchy"
+        )
     if role.kind == "agent":
         return GoalEnvJudge(role.spec)
     if role.skill is None:
+        for_whom = "skills with goals and for plain agents" if config.hindsight else "skills"
         raise DeclarationError(
-            f"the {role.kind} {role.path!r} cannot learn with hindsight, which is for skills with "
-            "goals and for plain agents: give it an algorithm without hindsight"
+            f"the {role.kind} {role.path!r} cannot learn with {setting}, which is for {for_whom}: "
+            f"give it an algorithm without {setting}"
         )
-    return SkillJudge(role.skill, role.part, spaces.observation, spaces.action)
+    shared = None
+    if config.shared_replay:
+        shared = {} if config.hindsight else role.info_read
+    return SkillJudge(
+        role.skill,
+        role.part,
+        spaces.observation,
+        spaces.action,
+        hindsight=bool(config.hindsight),
+        shared=shared,
+    )
 
 
-def try_judge(judge: Judge, spec: EnvSpec) -> None:
+def try_judge(judge: Judge, config: Any, spec: EnvSpec) -> None:
     """Judge the first steps of two episodes, before steps are spent.
 
     Raises:
         SkillweaveError: what the user has written cannot judge them.
     """
-    engine = make_engine(spec, 2)
-    rng = np.random.default_rng(0)
-    codec = action_codec(engine.action_space)
-    try:
-        obs = np.array(engine.reset(0))
-        action = codec.from_env(draw_from(engine.action_space, 2, rng))
-        if (mask := engine.mask()) is not None:
-            action = codec.allowed_at_random(action, mask, rng)
-        done = codec.to_env(action)
-        step = engine.step(done)
-    finally:
-        engine.close()
-    known = {"env_action": done, "env_reward": step.reward, "env_terminated": step.terminated}
-    known |= {"env_truncated": step.truncated, "call_elapsed": np.ones(2, np.int64)}
+    step = first_step(spec)
+    known = {name: getattr(step, field) for name, field in OF_STEP.items() if "obs" not in name}
+    known["call_elapsed"] = step.elapsed
     columns = {k: known.get(k, np.repeat(x, 2, axis=0)) for k, x in judge.examples.items()}
-    rows = RawRows(obs, np.array(step.next_obs), columns)
-    reached = judge.achieved(rows.next_obs)
-    judge.judged(rows, reached)
-    judge.check(rows, reached, differ=True)
+    rows = RawRows(step.obs, step.next_obs, columns)
+    if config.hindsight:
+        reached = judge.achieved(step.next_obs)
+        judge.judged(rows, reached)
+        judge.check(rows, reached, differ=True)
+    if isinstance(judge, SkillJudge) and config.shared_replay:
+        goal = judge.goals(rows)
+        if goal is not None:
+            goal = judge.practised(step.obs, np.random.default_rng(0))
+        judge.check_shared(rows, goal)
 
 
 def store_of(
@@ -288,7 +312,7 @@ def store_of(
     Args:
         num_envs: of all members together.
         shared: each member learns from the experience of all.
-        judge: judges rows again; None: without hindsight.
+        judge: judges rows again; None: nobody does.
 
     Raises:
         TrainingError: the store is larger than the machine's memory.
@@ -296,18 +320,17 @@ def store_of(
     """
     config, codec = algorithm.config, algorithm.codec
     capacity = config.buffer_size * (1 if shared else members)
-    choices = codec.size if codec.discrete else 0
     device = resolve_device(config.device)
     if judge is not None:
-        return HindsightStore(
+        return JudgedStore(
             capacity,
             num_envs,
             members,
             codec.zeros(1),
-            config.hindsight,
+            config.hindsight or None,
+            config.shared_replay,
             judge,
             raw=[name for name in algorithm.raw if name not in judge.examples],
-            choices=choices,
             shared=shared,
             device=device,
         )
@@ -317,7 +340,7 @@ def store_of(
         members,
         algorithm.observation_space,
         codec.zeros(1),
-        choices=choices,
+        choices=codec.size if codec.discrete else 0,
         shared=shared,
         n_step=config.n_step,
         prioritized=config.prioritized,

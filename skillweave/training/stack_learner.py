@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from skillweave._internal.seeding import Seeds
-from skillweave.buffers.hindsight import Judge
+from skillweave.buffers.judged import Judge
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.replay_learner import ReplayLearner, store_of
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from skillweave._internal.notices import notice
-from skillweave._internal.paths import SELECTOR, join
+from skillweave._internal.paths import SELECTOR, join, level_of
 from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import (
@@ -163,6 +163,7 @@ def check_stages(entries: Sequence[StageEntry], eval_every: int | None, keep: st
             "keep is 'best', but nothing is evaluated while it trains: set eval_every to the "
             "environment steps between evaluations"
         )
+    _check_sharing(entries)
     for entry in entries:
         where = f"stage {entry.name!r}"
         evolves = entry.evolution is not None
@@ -195,6 +196,32 @@ def check_stages(entries: Sequence[StageEntry], eval_every: int | None, keep: st
             raise DeclarationError(
                 f"{where}: it has a target_{target.of}, but is not evaluated while it trains: "
                 "set eval_every to the environment steps between evaluations"
+            )
+
+
+def _check_sharing(entries: Sequence[StageEntry]) -> None:
+    """Raise a DeclarationError where skills that learn apart cannot begin with earlier steps."""
+    first: dict[str, StageEntry] = {}
+    for entry in entries:
+        if not entry.algorithm.get("shared_replay"):
+            continue
+        if entry.evolution is not None:
+            raise DeclarationError(
+                f"stage {entry.name!r}: it evolves, and its algorithm has shared_replay, which is "
+                "not for populations: leave out one of them"
+            )
+        if not entry.shares:
+            continue
+        if not entry.algorithm["save_buffer"]:
+            raise DeclarationError(
+                f"stage {entry.name!r}: its algorithm has shared_replay, and skills that learn "
+                "apart hand their steps on in a file, but save_buffer is False: leave it out"
+            )
+        other = first.setdefault(level_of(entry.name), entry)
+        if entry.num_envs != other.num_envs:
+            raise DeclarationError(
+                f"stage {entry.name!r}: it learns from steps of {other.name!r} (shared_replay), so "
+                f"num_envs must be equal, but is {entry.num_envs} and {other.num_envs}"
             )
 
 
@@ -278,6 +305,6 @@ def check_replay(entry: StageEntry, role: Role) -> None:
         judge = judge_of(config, role)
         store_of(algorithm, config.num_envs * members, members, shared=members > 1, judge=judge)
         if judge is not None:
-            try_judge(judge, role.spec)
+            try_judge(judge, config, role.spec)
     except SkillweaveError as error:
         raise reworded(error, f"stage {entry.name!r}: {error}") from error

@@ -13,7 +13,7 @@ from declaring import declare
 from small_runs import goes_on, reports_every, stopped_run
 
 import skillweave as sw
-from skillweave.buffers.hindsight import HindsightStore
+from skillweave.buffers.judged import JudgedStore
 from skillweave.errors import DeclarationError, EnvError, TrainingError
 from skillweave.evolution import Evolution
 
@@ -185,11 +185,11 @@ def test_members_of_a_population_have_hindsight(tmp_path):
 def test_calls_that_follow_one_another_with_the_same_goal_stay_two(tmp_path, monkeypatch):
     left: list[Any] = []
 
-    def look(store: HindsightStore) -> None:
+    def look(store: JudgedStore) -> None:
         filled = np.flatnonzero(store._columns.data["kind"])
         left.append(store._columns.rows_left(filled))
 
-    monkeypatch.setattr(HindsightStore, "_check", look)
+    monkeypatch.setattr(JudgedStore, "_check", look)
 
     def always(obs: Any) -> Any:
         return np.full(len(obs), "go_to"), np.full((len(obs), 2), 9.0)
