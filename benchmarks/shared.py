@@ -127,7 +127,8 @@ def main() -> None:
     asked = parser.parse_args()
     jobs = [(kind, seed) for seed in asked.seeds for kind in asked.kinds]
     with workers(2) as pool:
-        found = dict(zip(jobs, pool.map(trained, *zip(*jobs, strict=True)), strict=True))
+        futures = {job: pool.submit(trained, *job) for job in jobs}
+        found = {job: future.result() for job, future in futures.items()}
     zero = nothing()
     rows = []
     for (kind, seed), row in found.items():
