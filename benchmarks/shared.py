@@ -16,7 +16,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from benchmarks.common import report, table, workers

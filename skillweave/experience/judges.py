@@ -311,12 +311,13 @@ def info_read(spec: EnvSpec, skills: Sequence[Skill]) -> dict[str, Array]:
         for method in filter(skill.defines, ("reward", "termination")):
             call_method(skill, method, seen)
         for key in info.read:
-            value = np.asarray(step.info[key] if key in step.info else None)
+            given = step.info.get(key)
+            value = np.asarray(given)
             if value.dtype.kind not in "biuf" or value.shape[:1] != (2,):
                 raise DeclarationError(
                     f"skill {path_of(skill)!r}: its algorithm has shared_replay, which stores what "
-                    f"it reads of info with each step, but info[{key!r}] is {short(step.info.get(key))} "
-                    "after the first step; a number for each environment is needed in each step"
+                    f"it reads of info in each step, but info[{key!r}] is {short(given)} after the "
+                    "first step; a number for each environment is needed in each step"
                 )
             found[key] = value[:1]
     return found

@@ -1,0 +1,204 @@
+"""Trainings of skills that share their steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from declaring import declare
+from small_runs import goes_on, reports_every, stopped_run
+
+import skillweave as sw
+from skillweave.buffers.judged import JudgedStore
+from skillweave.errors import DeclarationError, RunError, SkillError, TrainingError
+from skillweave.evolution import Evolution
+
+often = reports_every(75)
+SMALL = sw.Network((16,), "relu")
+SHARES = sw.SAC(
+    num_envs=4,
+    learning_starts=60,
+    batch_size=32,
+    buffer_size=2_000,
+    network=SMALL,
+    shared_replay=0.5,
+)
+PPO = sw.PPO(num_envs=4, n_steps=16, network=SMALL)
+
+
+class Line(gym.Env):
+    """A point on a line, which is pushed; its speed is told."""
+
+    observation_space = gym.spaces.Box(-10, 10, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.place = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        self.time = 0
+        return self.place.copy(), {}
+
+    def step(self, action: Any) -> Any:
+        self.place = np.clip(self.place + 0.5 * np.float32(action), -9, 9).astype(np.float32)
+        self.time += 1
+        info = {"speed": float(action[0]), "note": "x", "late": self.time}
+        return self.place.copy(), 0.0, False, self.time >= 20, info
+
+
+class Up(sw.Skill):
+    """Go up."""
+
+    max_steps = 10
+    algorithm: Any = SHARES
+
+    def reward(self, step: Any) -> Any:
+        return step.next_obs[:, 0] - step.obs[:, 0]
+
+
+class Down(Up):
+    """Go down, by what the environment tells."""
+
+    def reward(self, step: Any) -> Any:
+        return -step.info["speed"]
+
+
+def sharing(*skills: Any, **how: Any) -> sw.Hierarchy:
+    """Two skills that share, or others, in one small hierarchy."""
+    plain = {"env": Line, "learn": "apart", "selector": PPO, "skill_steps": 300}
+    plain |= {"selector_steps": 64, "together_steps": 300, "call_steps": 5}
+    return declare(*(x() for x in skills or (Up, Down)), **plain | how)
+
+
+@pytest.mark.parametrize(("learn", "tick"), [("apart", 6), ("together", 3)])
+def test_a_run_that_is_resumed_ends_with_the_same_weights(learn, tick, tmp_path):
+    goes_on(lambda: sharing(learn=learn), tmp_path, tick=tick)
+
+
+def test_steps_are_handed_on_and_then_deleted(tmp_path, monkeypatch):
+    sizes: list[int] = []
+    plain = JudgedStore.begin_with
+
+    def begin_with(store: JudgedStore, shared: Any) -> Any:
+        yield from plain(store, shared)
+        sizes.append(len(store))
+
+    monkeypatch.setattr(JudgedStore, "begin_with", begin_with)
+    third = type("Third", (Up,), {})
+    sharing(Up, Down, third).train(tmp_path / "run", seed=0, quiet=True)
+    assert sizes == [300, 600]
+    assert not (tmp_path / "run" / "replay").exists()
+
+
+def test_the_share_of_others_is_as_declared(tmp_path, monkeypatch):
+    drawn: list[float] = []
+    plain = JudgedStore.sample
+
+    def sample(store: JudgedStore, *args: Any) -> Any:
+        found = plain(store, *args)
+        own = store._columns.data["own"][found.index % store._columns.slots]
+        drawn.append(1.0 - own.mean())
+        return found
+
+    monkeypatch.setattr(JudgedStore, "sample", sample)
+    algorithm = replace(SHARES, shared_replay=0.25)
+    skills = [type(x.__name__, (x,), {"algorithm": algorithm}) for x in (Up, Down)]
+    sharing(*skills, learn="together").train(tmp_path / "run", seed=0, quiet=True)
+    assert np.mean(drawn) == pytest.approx(0.25, abs=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("learn", ["apart", "together"])
+def test_skills_learn_from_others_steps_alone(learn, tmp_path):
+    algorithm = replace(SHARES, shared_replay=1.0, update_ratio=2.0)
+    skills = [type(x.__name__, (x,), {"algorithm": algorithm}) for x in (Up, Down)]
+    run = sharing(*skills, learn=learn, skill_steps=1_500, together_steps=3_000).train(
+        tmp_path / "run", seed=0, quiet=True
+    )
+    found = run.evaluate(20, skill="down", seed=1, quiet=True).skills["down"]
+    assert found.return_sum / found.calls > 8
+
+
+def test_a_run_whose_shared_steps_were_deleted_is_told(tmp_path):
+    run = tmp_path / "run"
+    stopped_run(sharing(), run, 6)
+    for path in (*run.glob("checkpoint*"), *run.glob("replay/*")):
+        path.unlink()
+    with pytest.raises(RunError, match="is not there any more"):
+        sharing().resume(run, quiet=True)
+
+
+class Timed(Up):
+    def reward(self, step: Any) -> Any:
+        return step.next_obs[:, 0] - 0.1 * step.elapsed
+
+
+class Ends(Up):
+    def termination(self, step: Any) -> Any:
+        return step.timed_out
+
+
+class Noted(Up):
+    def reward(self, step: Any) -> Any:
+        return step.info["note"] == "x"
+
+
+class Later(Up):
+    def reward(self, step: Any) -> Any:
+        far = np.abs(step.obs[:, 0]) > 1.05
+        return step.info["late"] * 1.0 if far.any() else step.next_obs[:, 0]
+
+
+class Draws(Up):
+    seen = 0.0
+
+    def reward(self, step: Any) -> Any:
+        self.seen += 1.0
+        return self.seen + step.next_obs[:, 0]
+
+
+def with_algorithm(skill: Any, **settings: Any) -> Any:
+    """A kind of skill with other settings of its algorithm."""
+    return type(skill.__name__, (skill,), {"algorithm": replace(SHARES, **settings)})
+
+
+@pytest.mark.parametrize(
+    ("skills", "words"),
+    [
+        ((Timed, Up), r"reward\(\) reads step.elapsed"),
+        ((Up, Ends), r"termination\(\) reads step.timed_out"),
+        ((Up, Noted), r"info\['note'\]"),
+        ((Up, type("Changes", (Up,), {"reward_changes": True})), "reward_changes"),
+        ((Up, with_algorithm(Down, num_envs=2)), "num_envs must be equal, but is 2 and 4"),
+        ((Up, with_algorithm(Down, save_buffer=False)), "save_buffer is False"),
+    ],
+)
+def test_skills_that_cannot_share_are_refused_before_steps_are_spent(skills, words, tmp_path):
+    with pytest.raises(DeclarationError, match=words):
+        sharing(*skills).train(tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_populations_do_not_share(tmp_path):
+    with pytest.raises(DeclarationError, match="not for populations"):
+        sharing().train(tmp_path / "run", evolve=Evolution(population=2, generations=2), quiet=True)
+
+
+def test_a_corrected_policy_cannot_share(tmp_path):
+    policy = sw.Residual(lambda obs: np.zeros((len(obs), 2)), scale=0.1)
+    corrected = type("Corrected", (Up,), {"policy": policy})
+    with pytest.raises(DeclarationError, match="Residual"):
+        sharing(corrected, Up).train(tmp_path / "run", quiet=True)
+
+
+def test_a_key_that_is_read_later_is_refused(tmp_path):
+    with pytest.raises((DeclarationError, SkillError), match=r"info\['late'\]"):
+        sharing(Later, Up).train(tmp_path / "run", seed=0, quiet=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*keeps a state", "ignore:.*reward")
+def test_a_reward_that_keeps_a_state_stops_training(tmp_path):
+    with pytest.raises((TrainingError, SkillError)):
+        sharing(Draws, Up).train(tmp_path / "run", seed=0, quiet=True)
