@@ -227,7 +227,7 @@ RANGES: dict[Any, str] = {
         "action_repeat activation architecture epsilon epsilon_final epsilon_fraction "
         "exploration_final_eps exploration_fraction exploration_initial_eps gae_lambda gamma "
         "hyperparameters layer_share none parameters priority_alpha priority_beta quota share "
-        "step tau"
+        "shared_replay step tau"
     ),
     Share: ("target_success"),
     Positive: (

@@ -88,7 +88,7 @@ class JudgedStore(ReplayStore):
         hindsight: draws rows with a goal that their call has reached; None: with their own alone.
         of_others: the share of drawn rows that other skills have made.
         judge: of the learner.
-        others: as of ``ReplayStore``.
+        more: as of ``ReplayStore``.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class JudgedStore(ReplayStore):
         hindsight: Hindsight | None,
         of_others: float,
         judge: Judge,
-        **others: Any,
+        **more: Any,
     ) -> None:
         space = judge.observation_space
         examples = dict(judge.examples)
@@ -115,10 +115,10 @@ class JudgedStore(ReplayStore):
             choices=judge.choices,
             examples=examples,
             calls=True,
-            **others,
+            **more,
         )
         self._hindsight = hindsight
-        self._others = of_others
+        self._of_others = of_others
         self._judge = judge
         self._checked = False
         self._compared = 0
@@ -129,10 +129,15 @@ class JudgedStore(ReplayStore):
         """The raw columns that are needed."""
         return (*super().raw, "call_end")
 
-    def seen(self, batch: Batch) -> Array:
-        """Return the observations (T, N, …) of a batch as the learner sees them."""
+    def seen(self, batch: Batch) -> tuple[Array, Array | None]:
+        """Return a batch's observations as the learner sees them; see ``ReplayStore.seen``.
+
+        Those of others are among them, unless goals belong to them, which are drawn later.
+        """
         rows = RawRows(batch["obs"], batch["next_obs"], batch)
-        return self._judge.seen(rows.obs, self._judge.goals(rows))
+        goals = self._judge.goals(rows)
+        counts = batch.own_rows if "own" in batch and goals is not None else batch.get("valid")
+        return self._judge.seen(rows.obs, goals), counts
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Restore the ``state`` of a store that was made with the same arguments."""
@@ -160,8 +165,8 @@ class JudgedStore(ReplayStore):
         shape = index.shape
         slot = (index % self._columns.slots).ravel()
         rows = self._rows(slot)
-        mine = rows.columns["own"] if self._others else np.ones(len(slot), bool)
-        goal, given = self._goals(rows, slot, mine, rngs)
+        own = rows.columns["own"] if self._of_others else np.ones(len(slot), bool)
+        goal, given = self._goals(rows, slot, own, rngs)
         # All are judged, so that own rows with their own goals show where something has changed.
         reward, ends = self._judge.judged(rows, goal)
         self._compare(slot[given], reward[given], ends[given])
@@ -191,12 +196,8 @@ class JudgedStore(ReplayStore):
         """Return copies of the rows without what is this learner's alone; see ``begin_with``."""
         return {name: x for name, x in self.state().items() if name not in OWN_COLUMNS}
 
-    def begin_with(self, shared: Mapping[str, Tensor]) -> Iterator[tuple[Array, Array]]:
-        """Fill an empty store with the ``shared_rows`` of another learner's.
-
-        Yields:
-            Piece by piece, observations (T, N, …) as this learner sees them, and which it learns
-            from, (T, N) bool.
+    def begin_with(self, shared: Mapping[str, Tensor]) -> Iterator[Batch]:
+        """Fill an empty store with the ``shared_rows`` of another learner's; yield what is stored.
 
         Raises:
             RunError: they are not of such a store.
@@ -232,7 +233,7 @@ class JudgedStore(ReplayStore):
                 **(raw | {"own": np.zeros(at.shape, bool)}),
             )
             self.add(batch)
-            yield self.seen(batch), batch["valid"]
+            yield batch
 
     def _columns_of(self, shared: Mapping[str, Tensor]) -> Columns:
         """Return storage that holds the ``shared_rows`` of another store."""
@@ -253,16 +254,19 @@ class JudgedStore(ReplayStore):
     ) -> Array:
         """Draw transitions (P, B), as running numbers; a share of them of other skills."""
         columns = self._columns
-        stored = columns.data["kind"] != NOTHING
-        others = np.flatnonzero(stored & ~columns.data["own"]) if self._others else ()
+        others: Array = np.zeros(0, np.int64)
+        if self._of_others:
+            used = columns.used() * columns.num_envs
+            stored, own = (columns.data[name][:used] for name in ("kind", "own"))
+            others = np.flatnonzero((stored != NOTHING) & ~own)
         if not len(others):
             return self._draw(batch, rngs, beta, first)[0]
-        own = np.flatnonzero(stored & columns.data["own"])
+        mine = np.flatnonzero((stored != NOTHING) & own)
         (rng,) = rngs  # a population shares nothing
-        theirs = rng.random(batch) < (self._others if len(own) else 1.0)
+        theirs = rng.random(batch) < (self._of_others if len(mine) else 1.0)
         slot = others[rng.integers(len(others), size=batch)]
-        if len(own):
-            slot = np.where(theirs, slot, own[rng.integers(len(own), size=batch)])
+        if len(mine):
+            slot = np.where(theirs, slot, mine[rng.integers(len(mine), size=batch)])
         return columns.number(slot[None])
 
     def _goals(
@@ -328,7 +332,7 @@ class JudgedStore(ReplayStore):
             TrainingError: they are judged otherwise than they were.
         """
         data = self._columns.data
-        own = data["own"] if self._others else True
+        own = data["own"] if self._of_others else True
         filled = np.flatnonzero((data["kind"] != NOTHING) & own)
         if not len(filled):
             return

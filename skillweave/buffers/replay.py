@@ -96,9 +96,12 @@ class ReplayStore:
         """The raw columns that are stored."""
         return self._columns.raw
 
-    def seen(self, batch: Batch) -> Array:
-        """Return the observations (T, N, …) of a batch as the learner sees them."""
-        return batch["obs"]
+    def seen(self, batch: Batch) -> tuple[Array, Array | None]:
+        """Return a batch's observations (T, N, …) as the learner sees them, and which count.
+
+        The latter are (T, N) bool; None: all count.
+        """
+        return batch["obs"], batch.get("valid")
 
     @property
     def ready(self) -> bool:

@@ -112,7 +112,7 @@ class ReplayLearner:
         batch = batches[""]
         self.store.add(batch)
         self._transitions[1] += int(batch.own_rows.sum()) / self.members
-        self._see(self.store.seen(batch), batch.get("valid"))
+        self._see(batch)
         if any(s.algorithm.scales_rewards for s in self.stacks):
             self._scale_returns(batch)
 
@@ -124,11 +124,12 @@ class ReplayLearner:
     def begin_with(self, shared: Mapping[str, Tensor]) -> None:
         """Begin with the rows of another skill's store, see ``JudgedStore``."""
         assert isinstance(self.store, JudgedStore)
-        for obs, valid in self.store.begin_with(shared):
-            self._see(obs, valid)
+        for batch in self.store.begin_with(shared):
+            self._see(batch)
 
-    def _see(self, obs: Array, valid: Array | None) -> None:
-        """Update the running scales of observations (T, N, …) that are to be learnt from."""
+    def _see(self, batch: Batch) -> None:
+        """Update the running scales of observations."""
+        obs, valid = self.store.seen(batch)
         for i, stack in enumerate(self.stacks):
             columns = self._columns(i)
             stack.algorithm.update_obs_stats(

@@ -52,6 +52,7 @@ class World:
         self.nested = self.together and bool(rng.random() < 0.3)
         self.buffer = int(rng.choice([40, 2_000]))
         self.share = float(rng.choice([0.3, 1.0]))
+        self.normal = bool(rng.random() < 0.3)
 
     def make(self) -> Plane:
         return Plane(self)
@@ -128,6 +129,7 @@ class Mover(sw.Skill):
             action_repeat=0.0,
             hindsight=world.hindsight,
             shared_replay=world.share,
+            normalize_obs=world.normal,
         )
 
     def reward(self, step: Any) -> Any:
