@@ -43,7 +43,7 @@ def run_page(page: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 def _sooner(config: Any) -> Any:
     if not hasattr(config, "learning_starts"):
         return config
-    return replace(config, learning_starts=STEPS - 100)
+    return replace(config, learning_starts=min(config.learning_starts, STEPS - 100))
 
 
 def _smaller(search: Any) -> Any:

@@ -7,8 +7,9 @@ store that asks them is ``buffers.judged.JudgedStore``.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NoReturn
 
 import gymnasium as gym
@@ -294,33 +295,41 @@ def first_step(spec: EnvSpec) -> Step:
         engine.close()
 
 
-def info_read(spec: EnvSpec, skills: Sequence[Skill]) -> dict[str, Array]:
-    """Return the keys of ``info`` that rewards and ends of skills read, with an example (1, …).
+@dataclass
+class Sharing:
+    """Skills of a hierarchy that learn from each other's steps."""
 
-    Raises:
-        DeclarationError: a key is no number of each environment, or is not always there.
-        SkillError: a skill's method failed.
-    """
-    step = first_step(spec)
-    found: dict[str, Array] = {}
-    for skill in skills:
-        info = _NotedInfo(step.info)
-        goals = goals_of(skill)
-        goal = None if goals is None else goals.draw(step.obs, np.random.default_rng(0))
-        seen = part_of(replace(step, info=info), step.elapsed, None, skill.max_steps, goal)
-        for method in filter(skill.defines, ("reward", "termination")):
-            call_method(skill, method, seen)
-        for key in info.read:
-            given = step.info.get(key)
-            value = np.asarray(given)
-            if value.dtype.kind not in "biuf" or value.shape[:1] != (2,):
-                raise DeclarationError(
-                    f"skill {path_of(skill)!r}: its algorithm has shared_replay, which stores what "
-                    f"it reads of info in each step, but info[{key!r}] is {short(given)} after the "
-                    "first step; a number for each environment is needed in each step"
-                )
-            found[key] = value[:1]
-    return found
+    spec: EnvSpec
+    skills: tuple[Skill, ...]
+
+    @cached_property
+    def info(self) -> dict[str, Array]:
+        """The keys of ``info`` that rewards and ends of the skills read, with an example (1, …).
+
+        Raises:
+            DeclarationError: a key is no number of each environment, or is not always there.
+            SkillError: a skill's method failed.
+        """
+        step = first_step(self.spec)
+        found: dict[str, Array] = {}
+        for skill in self.skills:
+            info = _NotedInfo(step.info)
+            goals = goals_of(skill)
+            goal = None if goals is None else goals.draw(step.obs, np.random.default_rng(0))
+            seen = part_of(replace(step, info=info), step.elapsed, None, skill.max_steps, goal)
+            for method in filter(skill.defines, ("reward", "termination")):
+                call_method(skill, method, seen)
+            for key in info.read:
+                given = step.info.get(key)
+                value = np.asarray(given)
+                if value.dtype.kind not in "biuf" or value.shape[:1] != (2,):
+                    raise DeclarationError(
+                        f"skill {path_of(skill)!r}: its algorithm has shared_replay, which stores "
+                        f"what it reads of info in each step, but info[{key!r}] is {short(given)} "
+                        "after the first step; a number for each environment is needed in each step"
+                    )
+                found[key] = value[:1]
+        return found
 
 
 class GoalEnvJudge:

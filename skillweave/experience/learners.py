@@ -325,14 +325,14 @@ class LevelLearners:
         )
 
     def _of_skill(
-        self, trace: Trace, level: LearningLevel, i: int, acts: Array, end: Array, others: Array
+        self, trace: Trace, level: LearningLevel, i: int, acts: Array, end: Array, anyone: Array
     ) -> Batch:
         """Return the rows of a skill that learns, judged by its own reward and ends.
 
         Args:
             acts: (T, N) bool, where it acts.
             end: see ``_of_level``.
-            others: (T, N) bool, where it or another skill of its level acts.
+            anyone: (T, N) bool, where it or another skill of its level acts.
         """
         skill = level.skills[i]
         part = level.skill_set.part(i)
@@ -353,7 +353,7 @@ class LevelLearners:
         batch = _completed(batch, space, self._states.get(path), acts & ~trace.ended)
         if "own" not in record:
             return batch
-        return with_others(batch, trace, others, end, part, action_codec(space))
+        return with_others(batch, trace, anyone, end, part, action_codec(space))
 
     @staticmethod
     def _inside(

@@ -243,19 +243,19 @@ def own_actions(env_action: Array, part: OwnPart | None, codec: ActionCodec) -> 
 
 
 def with_others(
-    rows: Batch, trace: Trace, acts: Array, end: Array, part: OwnPart | None, codec: ActionCodec
+    rows: Batch, trace: Trace, anyone: Array, end: Array, part: OwnPart | None, codec: ActionCodec
 ) -> Batch:
     """Return a skill's rows with those of others beside them, which its own judge may judge later.
 
     Args:
         rows: of the skill, with raw columns; it is ``valid`` where it acts.
-        acts: (T, N) bool, where the skill or others act.
+        anyone: (T, N) bool, where the skill or another one acts.
         end: (T, N) int8, why calls ended after the step.
         part: of actions that the skill has; None: all.
         codec: of the skill's actions.
     """
     own = rows["valid"]
-    others = acts & ~own
+    others = anyone & ~own
     env_action = trace["env_action"]
     flat = env_action.reshape(-1, *env_action.shape[2:])
     action, possible = own_actions(flat, part, codec)
@@ -274,7 +274,7 @@ def with_others(
         terminated=terminated,
         truncated=truncated & ~terminated,
         valid=valid,
-        call_end=np.where(acts, end, RUNNING),
+        call_end=np.where(anyone, end, RUNNING),
         own=own,
     )
 

@@ -29,6 +29,7 @@ from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
+from skillweave.experience.judges import Sharing
 from skillweave.hierarchy.settings import Settings
 from skillweave.runs.user_code import Texts, environment_texts, skill_texts
 from skillweave.skills import ReadySelector, Skill, is_trained, ready_selector
@@ -169,12 +170,16 @@ class Level(LimitedCalls, Settings):
         skill = self.skills[path]
         config = self._config_of_skill(path)
         greedy = self.selection.greedy_skills is not False
-        sharing: tuple[Skill, ...] = ()
-        if _shares(config):
-            sharing = tuple(s for p, s in self.skills.items() if _shares(self._config_of_skill(p)))
+        sharing = self._sharing if _shares(config) else None
         return Role(
             path, "skill", spec, config, skill, greedy=greedy, rest=self.rest, sharing=sharing
         )
+
+    @cached_property
+    def _sharing(self) -> Sharing:
+        """Its skills that learn from each other's steps."""
+        skills = (s for path, s in self.skills.items() if _shares(self._config_of_skill(path)))
+        return Sharing(self.spec, tuple(skills))
 
     def _config_of_skill(self, path: str) -> AlgorithmConfig | None:
         """Return the algorithm that a skill learns by; None: it is ready, or a hierarchy."""

@@ -265,16 +265,14 @@ def judge_of(config: Any, role: Role) -> Judge | None:
             f"the {role.kind} {role.path!r} cannot learn with {setting}, which is for {for_whom}: "
             f"give it an algorithm without {setting}"
         )
-    shared = None
-    if config.shared_replay:
-        shared = {} if config.hindsight else role.info_read
+    sharing = role.sharing if config.shared_replay else None
     return SkillJudge(
         role.skill,
         role.part,
         spaces.observation,
         spaces.action,
         hindsight=bool(config.hindsight),
-        shared=shared,
+        shared=None if sharing is None else sharing.info,
     )
 
 

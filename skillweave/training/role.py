@@ -12,8 +12,7 @@ import gymnasium as gym
 from skillweave._internal.paths import AGENT, level_of
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
-from skillweave.experience.judges import info_read
-from skillweave.policies.core import Array
+from skillweave.experience.judges import Sharing
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import choice_space, with_goal
 from skillweave.skills.own_part import OwnPart
@@ -56,8 +55,8 @@ class Role:
     guide_kl: float | None = None
     """A selector stays within this KL of its guide while it learns; None: without limit."""
 
-    sharing: tuple[Skill, ...] = ()
-    """The skills of its hierarchy that learn from each other's steps, itself included."""
+    sharing: Sharing | None = None
+    """The skills of its hierarchy that learn from each other's steps; None: it learns alone."""
 
     @property
     def level(self) -> str:
@@ -104,16 +103,6 @@ class Role:
             return None
         spaces = self.spec.spaces.observation, self.spec.spaces.action
         return own_part(self.skill, self.rest, spaces, f"skill {self.path!r}", self.spec.name)
-
-    @cached_property
-    def info_read(self) -> dict[str, Array]:
-        """The keys of ``info`` that the skills ``sharing`` read, with an example (1, …).
-
-        Raises:
-            SkillweaveError: see ``judges.info_read``.
-        """
-        judged = [s for s in self.sharing if s.defines("reward") or s.defines("termination")]
-        return info_read(self.spec, judged) if judged else {}
 
 
 def agent_role(spec: EnvSpec) -> Role:

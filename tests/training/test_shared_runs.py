@@ -92,6 +92,21 @@ def test_steps_are_handed_on_and_then_deleted(tmp_path, monkeypatch):
     assert not (tmp_path / "run" / "replay").exists()
 
 
+def test_skills_with_and_without_hindsight_share(tmp_path):
+    class GoTo(Up):
+        goal_space = gym.spaces.Box(-2, 2, (1,), np.float32)
+        algorithm = replace(SHARES, hindsight=True)
+
+        def reward(self, step: Any) -> Any:
+            return -np.abs(step.next_obs[:, :1] - step.goal)[:, 0]
+
+        def achieved_goal(self, obs: Any) -> Any:
+            return obs[:, :1]
+
+    for i, skills in enumerate([(GoTo, Down), (Down, GoTo)]):
+        sharing(*skills).train(tmp_path / str(i), seed=0, quiet=True)
+
+
 def test_the_share_of_others_is_as_declared(tmp_path, monkeypatch):
     drawn: list[float] = []
     plain = JudgedStore.sample
