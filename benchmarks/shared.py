@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common import report, table, workers
-from skillweave import SAC, Hierarchy, Network, Skill, Step
+from skillweave import SAC, EnvSpec, Hierarchy, Network, Skill, Step
 from skillweave.types import Array
 
 CALLS = 100
@@ -93,12 +93,12 @@ def trained(kind: str, seed: int) -> dict[str, Any]:
     apart = kind == "apart"
     began = time.process_time()
     algorithm = SAC(
-        network=Network((256, 256), "relu"),
+        network=Network((128, 128), "relu"),
         update_ratio=1.0 if kind == "half" else 0.5,
         shared_replay=0.0 if apart else 0.5,
     )
     hierarchy = Hierarchy(
-        "HalfCheetah-v5",
+        EnvSpec("HalfCheetah-v5", workers=1),
         [Forward(), Back(), Stand()],
         algorithm=algorithm,
         selector=by_chance,
