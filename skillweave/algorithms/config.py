@@ -7,7 +7,7 @@ does not import torch, so that ``--help`` and argument errors are instant.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, TypeAlias
 
 import gymnasium as gym
@@ -656,6 +656,11 @@ def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
     name = type(config).__name__
     advice = "record a name, and let the algorithm look up what it means"
     return {"algorithm": name, **to_json(config, name, advice)}
+
+
+def alone(config: Any) -> Any:
+    """Return an algorithm's settings with which it learns from its own steps alone."""
+    return replace(config, shared_replay=0.0) if getattr(config, "shared_replay", 0.0) else config
 
 
 def own_encoders(config: Any) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from skillweave._internal.messages import as_path, short, shown_path
 from skillweave._internal.paths import join, level_of, name_of
 from skillweave.algorithms.agent_policy import AgentPolicy
-from skillweave.algorithms.config import OnPolicy, config_to_json
+from skillweave.algorithms.config import OnPolicy, alone, config_to_json
 from skillweave.api.applying import Trained, apply_manifest
 from skillweave.api.planning import lacking_features
 from skillweave.api.running import start_run, train_stages
@@ -76,7 +76,7 @@ def repair(
             f"{shown_path(source)} was loaded without its code, and training needs that: load it "
             "with the hierarchy that was trained: sw.load(directory, hierarchy)"
         )
-    config = learnt.algorithm.config
+    config = alone(learnt.algorithm.config)
     name = _stage_name(skill, {e.name for e in content.stages} | set(roles.skills))
     recorded = config_to_json(config)
     entry = StageEntry(name, "skill", [skill], None, steps, recorded, None, "waiting")

@@ -26,8 +26,8 @@ CHECKED = 1_000
 """The most rows that are judged again with their own goals, before anything is learnt."""
 FEW, SHARE = 2, 0.001
 """Rows that may be judged otherwise than they were: so many, or such a share."""
-PIECE = 4_096
-"""Rows of each environment that are taken over at once from another store."""
+PIECE = 1 << 26
+"""Bytes of observations that are taken over at once from another skill's rows."""
 OWN_COLUMNS = ("action", "reward", "goal", "own")
 """The columns that are a learner's alone."""
 
@@ -66,6 +66,10 @@ class Judge(Protocol):
         Args:
             differ: rewards or ends are others under these goals than under the rows' own.
         """
+        ...
+
+    def check_shared(self, rows: RawRows, goal: Array | None) -> None:
+        """Raise an error where steps of others cannot be judged."""
         ...
 
     def seen(self, obs: Array, goal: Array | None) -> Array:
@@ -120,7 +124,7 @@ class JudgedStore(ReplayStore):
         self._hindsight = hindsight
         self._of_others = of_others
         self._judge = judge
-        self._checked = False
+        self._draws = 0
         self._compared = 0
         self._wrong = 0
 
@@ -142,7 +146,7 @@ class JudgedStore(ReplayStore):
     def load(self, state: dict[str, Tensor]) -> None:
         """Restore the ``state`` of a store that was made with the same arguments."""
         super().load(state)
-        self._checked = False
+        self._draws = 0
 
     def sample(
         self,
@@ -158,9 +162,10 @@ class JudgedStore(ReplayStore):
         Raises:
             TrainingError: own rows with their own goals are judged otherwise than they were.
         """
-        if not self._checked:
+        self._draws += 1
+        checks = self._draws & (self._draws - 1) == 0  # the first, second, fourth, …
+        if checks:
             self._check()
-            self._checked = True
         index = self._drawn(batch, rngs, beta, first)
         shape = index.shape
         slot = (index % self._columns.slots).ravel()
@@ -169,6 +174,8 @@ class JudgedStore(ReplayStore):
         goal, given = self._goals(rows, slot, own, rngs)
         # All are judged, so that own rows with their own goals show where something has changed.
         reward, ends = self._judge.judged(rows, goal)
+        if checks and self._of_others:
+            self._judge.check_shared(rows, goal)
         self._compare(slot[given], reward[given], ends[given])
         action = self._columns.data["action"].take(slot, axis=0)
         if action.dtype.kind in "iu":
@@ -193,11 +200,24 @@ class JudgedStore(ReplayStore):
         )
 
     def shared_rows(self) -> dict[str, Tensor]:
-        """Return copies of the rows without what is this learner's alone; see ``begin_with``."""
-        return {name: x for name, x in self.state().items() if name not in OWN_COLUMNS}
+        """Return copies of the learner's own rows, without what is its alone; see ``begin_with``.
+
+        {}: it has none.
+        """
+        columns = self._columns
+        slot, stored = columns.in_order()
+        own = stored & columns.data["own"][slot]
+        if not own.any():
+            return {}
+        first = int(own.any(axis=1).argmax())  # those of others were there before
+        data = {k: x[slot[first:].ravel()] for k, x in columns.data.items() if k not in OWN_COLUMNS}
+        data["kind"][~own[first:].ravel()] = NOTHING
+        oldest = np.maximum(0, columns.newest - columns.rows + 1)
+        data["newest"] = columns.newest - oldest - first
+        return {name: to_tensor(x) for name, x in data.items()}
 
     def begin_with(self, shared: Mapping[str, Tensor]) -> Iterator[Batch]:
-        """Fill an empty store with the ``shared_rows`` of another learner's; yield what is stored.
+        """Add the ``shared_rows`` of another skill; yield what is stored.
 
         Raises:
             RunError: they are not of such a store.
@@ -210,8 +230,9 @@ class JudgedStore(ReplayStore):
         terminated = valid & data["env_terminated"][slot]
         truncated = valid & ~terminated
         truncated[:-1] &= (data["kind"][theirs.after(slot[:-1])] == NOTHING) | ~valid[1:]
-        for begin in range(0, len(slot), PIECE):
-            part = slice(begin, begin + PIECE)
+        rows = max(1, PIECE // data["obs"][: theirs.num_envs].nbytes)
+        for begin in range(0, len(slot), rows):
+            part = slice(begin, begin + rows)
             at = slot[part]
             raw = {name: data[name][at] for name in self.raw if name in data}
             if "goal" in self._judge.examples:
@@ -238,15 +259,15 @@ class JudgedStore(ReplayStore):
     def _columns_of(self, shared: Mapping[str, Tensor]) -> Columns:
         """Return storage that holds the ``shared_rows`` of another store."""
         (num_envs,) = shared["newest"].shape
-        used = len(shared["kind"]) // num_envs
+        rows = len(shared["kind"]) // num_envs
         examples = {k: x for k, x in self._judge.examples.items() if k not in OWN_COLUMNS}
         space, choices = self._judge.observation_space, self._judge.choices
         action = np.zeros(1, np.int64)
         columns = Columns(
-            (used - 1) * num_envs, num_envs, space, action, choices, 0, False, (), examples, True
+            (rows - 1) * num_envs, num_envs, space, action, choices, 0, False, (), examples, True
         )
-        own = {k: to_tensor(columns.data[k]) for k in OWN_COLUMNS if k in columns.data}
-        columns.load(own | dict(shared))
+        rest = columns.written() | columns.data  # what is a learner's alone stays empty
+        columns.load({name: to_tensor(x) for name, x in rest.items()} | dict(shared))
         return columns
 
     def _drawn(
@@ -322,11 +343,14 @@ class JudgedStore(ReplayStore):
         if kind == "episode":
             elapsed = columns.data["call_elapsed"].take(slot)
             before = np.minimum(elapsed - 1, columns.rows_before(slot))
-        drawn = np.floor(chance * (before + left + 1)).astype(np.int64)
-        return columns.further(slot, drawn - before)
+        drawn = np.floor(chance * (before + left + 1)).astype(np.int64) - before
+        later = columns.further(slot, drawn)
+        # Steps that a skill could not have made were left out, so it may be of another call.
+        same = columns.rows_left(later) == left - drawn
+        return np.where(same, later, slot)
 
     def _check(self) -> None:
-        """Judge own rows again before anything is learnt, with their own goals and others.
+        """Judge own rows again with their own goals, and before anything is learnt with others.
 
         Raises:
             TrainingError: they are judged otherwise than they were.
@@ -338,9 +362,10 @@ class JudgedStore(ReplayStore):
             return
         slot = filled[:: -(-len(filled) // CHECKED)]
         rows = self._rows(slot)
-        reward, ends = self._judge.judged(rows, self._judge.goals(rows))
+        goals = self._judge.goals(rows)
+        reward, ends = self._judge.judged(rows, goals)
         self._compare(slot, reward, ends)
-        if self._hindsight is not None:
+        if self._hindsight is not None and self._draws == 1:
             reached = self._judge.achieved(rows.next_obs)
             other, other_ends = self._judge.judged(rows, reached)
             differ = bool((other != reward).any() or (other_ends != ends).any())

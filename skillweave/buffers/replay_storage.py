@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from torch import Tensor
 
-from skillweave.algorithms.batches import Batch
+from skillweave.algorithms.batches import INFO, Batch
 from skillweave.buffers.ram import check_memory
 from skillweave.errors import DeclarationError, RunError
 from skillweave.policies.core import Array
@@ -34,7 +34,8 @@ class Columns:
 
     Args:
         action: an example of actions, (1, …).
-        choices: number of discrete actions; 0: actions are numbers, or have no masks.
+        choices: numbers of a mask, of which there are at least as many as discrete actions; 0:
+            actions are numbers, or have no masks.
         each: bytes that every transition takes elsewhere.
         keep_rewards: store the reward of every step of a call, so that any γ can be applied.
         raw: names of raw columns of ``SCHEMA`` that are stored unchanged, too.
@@ -64,7 +65,7 @@ class Columns:
                 f"buffer_size is {capacity}; it must be at least num_envs, {num_envs}"
             )
         chosen: Any = action.dtype
-        if choices:
+        if choices and action.dtype.kind in "iu":
             chosen = next(k for k in INTEGERS if choices - 1 <= np.iinfo(k).max)
         item = obs_dtype(observation_space)
         shape = obs_shape(observation_space)
@@ -207,6 +208,8 @@ class Columns:
             if name in state:
                 self._start(name)
         for name in self.raw:
+            if name.startswith(INFO) and name in state:
+                self.data[name] = self.data[name].astype(state[name].numpy().dtype)
             if name in self._started_raw:
                 continue
             self.data.pop(name, None)
@@ -262,6 +265,8 @@ class Columns:
         for name in (name for name in self.raw if name in rows):
             if name not in data:
                 self._start_raw(name, flat(rows[name]))
+            if name.startswith(INFO):
+                self._widen(name, rows[name].dtype)
             data[name][slot] = flat(rows[name])
         if "mask" in data:
             for slots, x in (after, next_mask), (slot, mask):
@@ -339,6 +344,12 @@ class Columns:
         check_memory(self.slots, each, f"the column {name!r} of a replay buffer", "buffer_size")
         self.data[name] = np.zeros((self.slots, *like.shape[1:]), like.dtype)
 
+    def _widen(self, name: str, kind: np.dtype[Any]) -> None:
+        """Let a column of ``info`` hold numbers of another type: whole ones first, others later."""
+        column = self.data[name]
+        if kind != column.dtype and not np.can_cast(kind, column.dtype):
+            self.data[name] = column.astype(number_type(np.result_type(kind, column.dtype)))
+
     def _store_rewards(self, slot: Array, rewards: Array, steps: Array) -> None:
         """Append the rewards (k, longest) of calls of ``steps`` (k,); missing ones are 0."""
         needed = int(steps.sum())
@@ -372,6 +383,13 @@ class Columns:
         offsets = steps.cumsum() - steps
         first = (self.data["call"].take(slot) - offsets).repeat(steps)
         return first + np.arange(len(first)), steps
+
+
+def number_type(kind: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type in which numbers of ``info`` of a type are stored: torch has it."""
+    if kind.kind == "b" or kind == np.float32:
+        return kind
+    return np.dtype(np.float64 if kind.kind == "f" else np.int64)
 
 
 def _split_rows(batch: Batch, most: int) -> list[Batch]:

@@ -18,6 +18,8 @@ import numpy as np
 from skillweave._internal.messages import error_text, short
 from skillweave._internal.notices import notice
 from skillweave.algorithms.batches import INFO, OF_STEP, RawRows
+from skillweave.buffers.replay_storage import number_type
+from skillweave.envs.env_infos import random_actions
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError, EnvError, SkillError, TrainingError
 from skillweave.experience.views import learner_obs, own_actions, step_of
@@ -25,8 +27,7 @@ from skillweave.policies.core import Array, Step, part_of, read_only
 from skillweave.policies.spaces import at, space_of
 from skillweave.skills import Skill, call_method
 from skillweave.skills.base import path_of
-from skillweave.skills.goal_spaces import draw_from
-from skillweave.skills.goals import fields_read, goals_of, reads_goal
+from skillweave.skills.goals import goals_of, reads_goal
 from skillweave.skills.outputs import call_user, checked
 from skillweave.skills.own_part import OwnPart
 from skillweave.skills.residual import Residual
@@ -83,6 +84,12 @@ class SkillJudge:
                 f"{self.who}: its algorithm has shared_replay, but its actions are added to those "
                 "of another policy (Residual), which other skills' actions are not: leave out "
                 "shared_replay"
+            )
+        if shared is not None and part is not None and part.part.holds:
+            raise DeclarationError(
+                f"{self.who}: its algorithm has shared_replay, but rest is 'hold': it is unknown "
+                "in which steps of other skills it could have left the rest of the action as it "
+                "was: give rest numbers, or leave out shared_replay"
             )
         self._skill = skill
         self._part = part
@@ -154,15 +161,19 @@ class SkillJudge:
         return call_method(self._skill, "reward", step, ids), ends
 
     def check_shared(self, rows: RawRows, goal: Array | None) -> None:
-        """Raise a DeclarationError where steps of others cannot be judged by the skill."""
-        step = self._step(rows, goal)
-        for method in ("reward", "termination"):
-            read = fields_read(self._skill, step, (method,)) or set()
-            if found := sorted(read & {"elapsed", "timed_out"}):
+        """Raise a DeclarationError where the time of a call changes how its steps are judged."""
+        shape = rows.columns["call_elapsed"].shape
+        found = []
+        for time in (1, 1 << 30):
+            columns = {**rows.columns, "call_elapsed": np.full(shape, time)}
+            found.append(self.judged(RawRows(rows.obs, rows.next_obs, columns), goal))
+        for what, early, late in zip(("reward", "termination"), *found, strict=True):
+            if not np.array_equal(early, late):
                 raise DeclarationError(
-                    f"{self.who}: its algorithm has shared_replay, but {method}() reads "
-                    f"step.{found[0]}, the time of its own call, which steps of other skills do "
-                    "not have: let it depend on what step.obs, action and next_obs show"
+                    f"{self.who}: its algorithm has shared_replay, but {what}() depends on "
+                    "step.elapsed or step.timed_out, the time of its own call, which steps of "
+                    "other skills do not have: let it depend on what step.obs, action and "
+                    "next_obs show"
                 )
 
     def check(self, rows: RawRows, goal: Array, *, differ: bool) -> None:
@@ -256,7 +267,7 @@ class _NotedInfo(Mapping[str, Any]):
     def __init__(self, info: Mapping[str, Any]) -> None:
         self._info = info
         self.keys_so_far = getattr(info, "keys_so_far", None)
-        self.read: dict[str, None] = {}
+        self.read: dict[Any, None] = {}
 
     def __getitem__(self, key: str) -> Any:
         self.read[key] = None
@@ -268,7 +279,7 @@ class _NotedInfo(Mapping[str, Any]):
         return self._info.get(key, default)
 
     def __contains__(self, key: object) -> bool:
-        self.read[str(key)] = None
+        self.read[key] = None
         return key in self._info
 
     def __iter__(self) -> Iterator[str]:
@@ -279,17 +290,13 @@ class _NotedInfo(Mapping[str, Any]):
 
 
 def first_step(spec: EnvSpec) -> Step:
-    """Return the first step of two episodes, with actions at random."""
-    engine = make_engine(spec, 2)
+    """Return the first step of an episode, with an action at random."""
+    engine = make_engine(spec, 1)
     rng = np.random.default_rng(0)
-    codec = action_codec(engine.action_space)
     try:
         obs = np.array(engine.reset(0))
-        action = codec.from_env(draw_from(engine.action_space, 2, rng))
-        if (mask := engine.mask()) is not None:
-            action = codec.allowed_at_random(action, mask, rng)
-        done = codec.to_env(action)
-        step = engine.step(done).seen(obs, done, np.ones(2, np.int64))
+        action = random_actions(engine.action_space, 1, rng, engine.mask())
+        step = engine.step(action).seen(obs, action, np.ones(1, np.int64))
         return replace(step, next_obs=np.array(step.next_obs))
     finally:
         engine.close()
@@ -322,13 +329,14 @@ class Sharing:
             for key in info.read:
                 given = step.info.get(key)
                 value = np.asarray(given)
-                if value.dtype.kind not in "biuf" or value.shape[:1] != (2,):
+                named = isinstance(key, str)
+                if not named or value.dtype.kind not in "biuf" or value.shape[:1] != (1,):
                     raise DeclarationError(
                         f"skill {path_of(skill)!r}: its algorithm has shared_replay, which stores "
                         f"what it reads of info in each step, but info[{key!r}] is {short(given)} "
                         "after the first step; a number for each environment is needed in each step"
                     )
-                found[key] = value[:1]
+                found[key] = value.astype(number_type(value.dtype))
         return found
 
 
@@ -430,6 +438,10 @@ class GoalEnvJudge:
         return mask
 
     def action(self, env_action: Array) -> tuple[Array, Array]:
+        """Raise an error: an agent has no other skills' steps."""
+        raise NotImplementedError
+
+    def check_shared(self, rows: RawRows, goal: Array | None) -> None:
         """Raise an error: an agent has no other skills' steps."""
         raise NotImplementedError
 

@@ -216,14 +216,29 @@ def rows_of(
     goal = None if goals is None else trace[path + "goal"]
     if "call_end" in record:
         found |= {"obs": trace["obs"], "next_obs": trace["next_obs"], "goal": goal}
-        keys = (name for name in record if name.startswith(INFO))
-        found |= {name: info_numbers_of(trace, name.removeprefix(INFO)) for name in keys}
+        found |= {name: _info_of(trace, name) for name in record if name.startswith(INFO)}
     else:
         found |= {k: learner_obs(trace[k], goal, goals, part) for k in ("obs", "next_obs")}
         if part is not None:
             found |= {k: part.part.mask(found[k]) for k in ("mask", "next_mask")}
     found |= {k: trace.get(path + k) for k in ("action", "dist_params")}
     return steps.replace(**found, steps=np.ones(trace.lead, np.int64))
+
+
+def _info_of(trace: Trace, name: str) -> Array:
+    """Return the column of a key of ``info`` that skills read in all steps, (T, N, …).
+
+    Raises:
+        EnvError: a step has no such key, or no number for each environment.
+    """
+    key = name.removeprefix(INFO)
+    for info in trace.infos:
+        if key not in info:
+            raise EnvError(
+                f"a skill with shared_replay reads info[{key!r}], which is stored with each step, "
+                "but no environment has set it in a later step: let them set it in each step"
+            )
+    return info_numbers_of(trace, key)
 
 
 def own_actions(env_action: Array, part: OwnPart | None, codec: ActionCodec) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from skillweave._internal.messages import short, suggest
 from skillweave._internal.paths import AGENT, CRITIC, SELECTOR, join
-from skillweave.algorithms.config import AlgorithmConfig, AlgorithmSettings
+from skillweave.algorithms.config import AlgorithmConfig, AlgorithmSettings, alone
 from skillweave.envs.make import Spaces
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.checks import (
@@ -172,7 +172,7 @@ class Declaration(Nestable, Declared):
                 "no part of this hierarchy is trained, so the flat baseline has no budget: set "
                 "steps"
             )
-        config = algorithm or self.train_defaults.flat or seeing_all(self.algorithm)
+        config = algorithm or self.train_defaults.flat or alone(seeing_all(self.algorithm))
         return PlainAgent(self.env, config, steps, train_defaults=self.train_defaults)
 
     def check_spaces(self) -> Spaces:

@@ -9,7 +9,7 @@ checkpoint.safetensors       the latest checkpoint of the stage in training (and
 calls.safetensors            calls of the skills (``planning/run_log.py``)
 policies/<stage>.safetensors policies of finished stages
 states/<name>.safetensors    states of learners that continue in a later stage, until that is done
-replay/<skill>.safetensors   steps of a skill that shares its replay, until the next one is done
+replay/<skill>.safetensors   steps of a skill that shares its replay, until the last one is done
 starts/<name>.safetensors    initial policies from another run, until their learner's stage is done
 starts/<stage>.safetensors   observations of a repair's rehearsal, until the repair is done
 final/<stage>.safetensors    final states, from which finished stages can train for more steps
@@ -459,27 +459,25 @@ class RunDirectory:
 
     def save_rows(self, entry: StageEntry, rows: Callable[[], Mapping[str, Tensor]]) -> None:
         """Write the rows of a stage's learner, if a later stage begins with them."""
-        if entry.shares and any(not x.done for x in self.sharing_stages(entry)[1]):
+        if entry.shares and any(not x.has_begun for x in self.sharing_stages(entry)[1]):
             self.write(REPLAY, entry.name, rows(), {}, entry.name)
 
-    def load_rows(self, entry: StageEntry) -> dict[str, Tensor] | None:
-        """Return the rows with which a stage's learner begins; None: there are none.
+    def load_rows(self, entry: StageEntry) -> Iterator[dict[str, Tensor]]:
+        """Yield the rows of earlier stages with which a stage's learner begins; {}: it has none.
 
         Raises:
-            RunError: the file is missing or damaged, or belongs to another run.
+            RunError: a file is missing or damaged, or belongs to another run.
         """
-        before = self.sharing_stages(entry)[0] if entry.shares else []
-        if not before or entry.name not in entry.learns:
-            return None
-        path = self.file(REPLAY, before[-1].name)
-        if not path.exists():
-            raise RunError(
-                f"{path} is not there any more: skill {entry.name!r} would learn from these steps "
-                f"of {before[-1].name!r} (shared_replay); begin a new run"
-            )
-        tensors, header = read_tensors(path, most=None)
-        self.must_be_ours(header.get("run"), path)
-        return tensors
+        for before in self.sharing_stages(entry)[0] if entry.shares else []:
+            path = self.file(REPLAY, before.name)
+            if not path.exists():
+                raise RunError(
+                    f"{path} is not there any more: skill {entry.name!r} would learn from these "
+                    f"steps of {before.name!r} (shared_replay); begin a new run"
+                )
+            tensors, header = read_tensors(path, most=None)
+            self.must_be_ours(header.get("run"), path)
+            yield tensors
 
     def drop_used(self, entry: StageEntry) -> None:
         """Remove the files of a finished stage that no later stage needs.
@@ -487,8 +485,8 @@ class RunDirectory:
         They are initial policies, the observations of a rehearsal, steps that are shared, and final
         states of learners.
         """
-        if entry.shares:
-            before, _ = self.sharing_stages(entry)
+        before, after = self.sharing_stages(entry) if entry.shares else ([], [])
+        if not any(not later.done for later in after):
             for earlier in before:
                 self.remove(REPLAY, earlier.name)
         for name in entry.learns:

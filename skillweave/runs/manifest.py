@@ -331,6 +331,11 @@ class StageEntry:
         return self.status == "done"
 
     @property
+    def has_begun(self) -> bool:
+        """True if it has trained, perhaps to an end, before its budget was raised."""
+        return self.status != "waiting" or bool(self.continued)
+
+    @property
     def shares(self) -> bool:
         """True if a skill learns apart here from its own steps and those of earlier ones."""
         alone = self.kind == "skill" and self.evolution is None and self.repair is None

@@ -116,16 +116,19 @@ class Goals(CallGoals):
 
 
 class _Watched(Step):
-    """A step that notes which of some fields are read."""
+    """A step that notes whether its goal is read."""
 
-    def __getattribute__(self, name: str) -> Any:
-        if name in WATCHED:
-            object.__getattribute__(self, "__dict__").setdefault("read", set()).add(name)
-        return object.__getattribute__(self, name)
+    reads = False
 
+    @property
+    def goal(self) -> Any:
+        """Return the goal, and note that it was read."""
+        self.reads = True
+        return self._goal
 
-WATCHED = ("goal", "elapsed", "timed_out")
-"""The fields of a step whose reading matters."""
+    @goal.setter
+    def goal(self, value: Any) -> None:
+        self._goal = value
 
 
 def check_reads_goal(skill: Skill, step: Step) -> None:
@@ -153,20 +156,13 @@ def reads_goal(skill: Skill, step: Step, methods: Sequence[str] = JUDGES) -> boo
 
     Where one of them fails, it does: that is raised where the step is judged.
     """
-    found = fields_read(skill, step, methods)
-    return found is None or "goal" in found
-
-
-def fields_read(skill: Skill, step: Step, methods: Sequence[str]) -> set[str] | None:
-    """Return which fields of ``WATCHED`` methods of a skill read; None: one of them fails."""
-    watched: Any = _Watched(**{field.name: getattr(step, field.name) for field in fields(Step)})
-    watched.read = set()
+    watched = _Watched(**{field.name: getattr(step, field.name) for field in fields(Step)})
+    watched.reads = False
     try:
         for method in filter(skill.defines, methods):
             who = f"skill {path_of(skill)!r}: {method}()"
             with untouched(skill):  # it leaves no traces
                 call_user(getattr(skill, method), watched, who, judges=None)
     except SkillweaveError:
-        return None
-    found: set[str] = watched.read
-    return found
+        return True
+    return watched.reads

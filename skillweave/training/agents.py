@@ -91,6 +91,8 @@ class Agents:
         for name in self.entry.learns:
             wanted = self._config(name), *self.roles[name].spaces
             self.algorithms[name] = self._equal_algorithm(*wanted) or make_algorithm(*wanted)
+        # Before the collectors: an environment may exist only once at a time.
+        self.judges = {k: judge_of(a.config, self.roles[k]) for k, a in self.algorithms.items()}
         self.earlier = {name: self._earlier_policy(name) for name in self.algorithms}
         how = task, self._acting(), self._margins(), stage.seeds / "global"
         self.collectors = self._make_collectors(
@@ -196,12 +198,12 @@ class Agents:
             self._quota(name),
             row_steps=self.roles[name].row_steps,
             goes_on_at=self.log.at.steps,
-            judge=judge_of(algorithm.config, self.roles[name]),
+            judge=self.judges[name],
         )
         if isinstance(learner, ReplayLearner) and not tensors:
-            rows = self.stage.run.load_rows(self.entry)
-            if rows is not None:
-                learner.begin_with(rows)
+            for rows in self.stage.run.load_rows(self.entry):
+                if rows:
+                    learner.begin_with(rows)
         if isinstance(learner, RolloutLearner):
             learner.reference = reference
             first = name == self.entry.decides

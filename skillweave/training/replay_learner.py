@@ -150,7 +150,12 @@ class ReplayLearner:
             valid = None if all_valid is None else all_valid[at]
             power = gamma ** batch["steps"][at].astype(np.float32)
             returns = self._returns * power + batch["reward"][at]
-            self._returns = returns if valid is None else np.where(valid, returns, self._returns)
+            if "own" in batch:  # where others act, its own call is over
+                self._returns = returns * batch.own_rows[at]
+            elif valid is None:
+                self._returns = returns
+            else:
+                self._returns = np.where(valid, returns, self._returns)
             for i, stack in enumerate(self.stacks):
                 columns = self._columns(i)
                 stack.algorithm.update_return_stats(
@@ -277,7 +282,7 @@ def judge_of(config: Any, role: Role) -> Judge | None:
 
 
 def try_judge(judge: Judge, config: Any, spec: EnvSpec) -> None:
-    """Judge the first steps of two episodes, before steps are spent.
+    """Judge the first step of an episode, before steps are spent.
 
     Raises:
         SkillweaveError: what the user has written cannot judge them.
@@ -285,16 +290,17 @@ def try_judge(judge: Judge, config: Any, spec: EnvSpec) -> None:
     step = first_step(spec)
     known = {name: getattr(step, field) for name, field in OF_STEP.items() if "obs" not in name}
     known["call_elapsed"] = step.elapsed
-    columns = {k: known.get(k, np.repeat(x, 2, axis=0)) for k, x in judge.examples.items()}
+    columns = {k: known.get(k, x) for k, x in judge.examples.items()}
     rows = RawRows(step.obs, step.next_obs, columns)
     if config.hindsight:
         reached = judge.achieved(step.next_obs)
         judge.judged(rows, reached)
         judge.check(rows, reached, differ=True)
-    if isinstance(judge, SkillJudge) and config.shared_replay:
+    if config.shared_replay:
         goal = judge.goals(rows)
         if goal is not None:
             goal = judge.practised(step.obs, np.random.default_rng(0))
+        judge.judged(rows, goal)
         judge.check_shared(rows, goal)
 
 

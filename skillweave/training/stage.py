@@ -201,28 +201,28 @@ def check_stages(entries: Sequence[StageEntry], eval_every: int | None, keep: st
 
 def _check_sharing(entries: Sequence[StageEntry]) -> None:
     """Raise a DeclarationError where skills that learn apart cannot begin with earlier steps."""
-    first: dict[str, StageEntry] = {}
+    levels: dict[str, list[StageEntry]] = {}
     for entry in entries:
-        if not entry.algorithm.get("shared_replay"):
-            continue
-        if entry.evolution is not None:
+        if entry.shares:
+            levels.setdefault(level_of(entry.name), []).append(entry)
+        if entry.evolution is not None and entry.algorithm.get("shared_replay"):
             raise DeclarationError(
                 f"stage {entry.name!r}: it evolves, and its algorithm has shared_replay, which is "
                 "not for populations: leave out one of them"
             )
-        if not entry.shares:
-            continue
-        if not entry.algorithm["save_buffer"]:
-            raise DeclarationError(
-                f"stage {entry.name!r}: its algorithm has shared_replay, and skills that learn "
-                "apart hand their steps on in a file, but save_buffer is False: leave it out"
-            )
-        other = first.setdefault(level_of(entry.name), entry)
-        if entry.num_envs != other.num_envs:
-            raise DeclarationError(
-                f"stage {entry.name!r}: it learns from steps of {other.name!r} (shared_replay), so "
-                f"num_envs must be equal, but is {entry.num_envs} and {other.num_envs}"
-            )
+    for level in levels.values():
+        for entry in level if len(level) > 1 else ():
+            if not entry.algorithm["save_buffer"]:
+                raise DeclarationError(
+                    f"stage {entry.name!r}: its algorithm has shared_replay, and skills that learn "
+                    "apart hand their steps on in files, but save_buffer is False: leave it out"
+                )
+            if entry.num_envs != level[0].num_envs:
+                raise DeclarationError(
+                    f"stage {entry.name!r}: it learns from steps of {level[0].name!r} "
+                    f"(shared_replay), so num_envs must be equal, but is {entry.num_envs} and "
+                    f"{level[0].num_envs}"
+                )
 
 
 ONE = "one collector (EnvSpec(workers=1), --collectors 1, Ray(collectors=1))"
