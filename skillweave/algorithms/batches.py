@@ -93,6 +93,13 @@ INFO = "info."
 """Prefix of the names of columns of ``info``: ``info.key``. They are recorded like raw columns."""
 
 
+def number_type(kind: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type in which numbers of ``info`` of a type are stored: torch has it."""
+    if kind.kind == "b" or kind == np.float32:
+        return kind
+    return np.dtype(np.float64 if kind.kind == "f" else np.int64)
+
+
 def column(name: str) -> Column:
     """Return a column of ``SCHEMA``, perhaps under a path; or the column of a key of ``info``."""
     if name.startswith(INFO):

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from torch import Tensor
 
-from skillweave.algorithms.batches import INFO, Batch
+from skillweave.algorithms.batches import INFO, Batch, number_type
 from skillweave.buffers.ram import check_memory
 from skillweave.errors import DeclarationError, RunError
 from skillweave.policies.core import Array
@@ -383,13 +383,6 @@ class Columns:
         offsets = steps.cumsum() - steps
         first = (self.data["call"].take(slot) - offsets).repeat(steps)
         return first + np.arange(len(first)), steps
-
-
-def number_type(kind: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type in which numbers of ``info`` of a type are stored: torch has it."""
-    if kind.kind == "b" or kind == np.float32:
-        return kind
-    return np.dtype(np.float64 if kind.kind == "f" else np.int64)
 
 
 def _split_rows(batch: Batch, most: int) -> list[Batch]:

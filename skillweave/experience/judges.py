@@ -17,8 +17,7 @@ import numpy as np
 
 from skillweave._internal.messages import error_text, short
 from skillweave._internal.notices import notice
-from skillweave.algorithms.batches import INFO, OF_STEP, RawRows
-from skillweave.buffers.replay_storage import number_type
+from skillweave.algorithms.batches import INFO, OF_STEP, RawRows, number_type
 from skillweave.envs.env_infos import random_actions
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError, EnvError, SkillError, TrainingError
