@@ -225,6 +225,7 @@ MODELS: dict[str, tuple[Callable[[Any, Any], Any], str]] = {
 @pytest.mark.parametrize("name", MODELS)
 def test_outputs_that_depend_on_more_than_the_observation_are_refused(name):
     function, says = MODELS[name]
+    torch.manual_seed(0)  # with few weights the first row of examples is the largest
     net = Net(function)
     if name == "buffer of one":
         net.register_buffer("h", torch.zeros(1, 4))
