@@ -163,7 +163,8 @@ class JudgedStore(ReplayStore):
             TrainingError: own rows with their own goals are judged otherwise than they were.
         """
         self._draws += 1
-        checks = self._draws & (self._draws - 1) == 0  # the first, second, fourth, …
+        # At the first, second, fourth, … draw: later steps may be judged by other lines.
+        checks = self._draws & (self._draws - 1) == 0
         if checks:
             self._check()
         index = self._drawn(batch, rngs, beta, first)
