@@ -23,7 +23,7 @@ from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
 
 CHECKED = 1_000
-"""The most rows that are judged again with their own goals, before anything is learnt."""
+"""The most own rows that are judged again at once, to compare with what was paid."""
 FEW, SHARE = 2, 0.001
 """Rows that may be judged otherwise than they were: so many, or such a share."""
 PIECE = 1 << 26

@@ -347,7 +347,7 @@ class Columns:
     def _widen(self, name: str, kind: np.dtype[Any]) -> None:
         """Let a column of ``info`` hold numbers of another type: whole ones first, others later."""
         column = self.data[name]
-        if kind != column.dtype and not np.can_cast(kind, column.dtype):
+        if not np.can_cast(kind, column.dtype):
             self.data[name] = column.astype(number_type(np.result_type(kind, column.dtype)))
 
     def _store_rewards(self, slot: Array, rewards: Array, steps: Array) -> None:

@@ -486,7 +486,7 @@ class RunDirectory:
         states of learners.
         """
         before, after = self.sharing_stages(entry) if entry.shares else ([], [])
-        if not any(not later.done for later in after):
+        if all(later.done for later in after):
             for earlier in before:
                 self.remove(REPLAY, earlier.name)
         for name in entry.learns:
