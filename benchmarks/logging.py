@@ -25,11 +25,11 @@ import skillweave as sw
 from benchmarks.common import median, report, table
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.agent_policy import make_algorithm
+from skillweave.calls.recorder import Recorder
 from skillweave.experience.acting import Acting, Request
 from skillweave.experience.learners import Calling
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import roles_of
-from skillweave.planning.recorder import Recorder
 from skillweave.training.evaluation import evaluate
 from skillweave.training.learning_task import LearningTask
 

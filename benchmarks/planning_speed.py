@@ -18,7 +18,8 @@ import numpy as np
 
 from benchmarks.common import median, report, table
 from skillweave import Hierarchy
-from skillweave.planning import Mission, Predicate, held
+from skillweave.calls import Predicate, held
+from skillweave.planning import Mission
 from skillweave.recipes._missions import HALF, POINTS
 
 DECISIONS = 200

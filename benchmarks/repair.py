@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import skillweave as sw
-from skillweave.planning import held
+from skillweave.calls import held
 from skillweave.recipes.lander_missions import GoLeft, GoRight, Hover, by_leg, declare
 
 HOVER_STEPS = 100

@@ -17,8 +17,9 @@ import pytest
 from shared_runs import SMALL
 
 import skillweave as sw
+from skillweave.calls import CallLog, join
 from skillweave.errors import RunError
-from skillweave.planning import CallLog, Mission, Planner, join
+from skillweave.planning import Mission, Planner
 from skillweave.runs.directory import CALLS
 from skillweave.runs.user_code import changes, code_sum, environment_texts, skill_texts
 

@@ -38,10 +38,10 @@ from skillweave import (
     SkillweaveError,
     Together,
 )
+from skillweave.calls.columns import ENDS
 from skillweave.cli import main
 from skillweave.hierarchy.roles import roles_of
 from skillweave.hierarchy.select_best import resolve_greedy
-from skillweave.planning.columns import ENDS
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import episode_seeds, evaluate

@@ -21,7 +21,7 @@ train_agent tree
 """
 
 
-SHIPPED = (*HOMES, "skillweave.toys", "skillweave.planning")
+SHIPPED = (*HOMES, "skillweave.toys", "skillweave.calls", "skillweave.planning")
 """Modules that users import from."""
 
 

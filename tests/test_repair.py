@@ -16,12 +16,13 @@ from small_runs import assert_same, stage_entry
 import skillweave as sw
 from skillweave.algorithms import ppo
 from skillweave.api import Run, repairing
+from skillweave.calls import Handover, held, record_calls
+from skillweave.calls.record import RandomChoice
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.experience.collector import Collector
 from skillweave.hierarchy import repair
 from skillweave.hierarchy.roles import roles_of
-from skillweave.planning import Handover, Mission, held, record_calls
-from skillweave.planning.record import RandomChoice
+from skillweave.planning import Mission
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Matrix, RepairEntry
 

@@ -41,9 +41,9 @@ BASE = {
 }
 USED = {"algorithms", "envs", "errors", "evolution", "types"}  # users import from these, too
 LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
-LEARNING |= {"experience", "workers", "planning"}
+LEARNING |= {"experience", "workers", "calls"}
 EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "export"}
-EVERYTHING |= {"shipped", "api"}
+EVERYTHING |= {"shipped", "api", "extensions", "planning"}
 ROOMS: dict[str, set[str]] = {
     "public": set(),
     "seeding": set(),
@@ -64,6 +64,7 @@ ROOMS: dict[str, set[str]] = {
     "named": {"errors", "messages"},
     "schema": {"errors", "messages", "arguments", "policies"},
     "_internal": set(),
+    "extensions": {"errors"},
     "interrupts": {"terminal"},
     "ops": BASE,
     "spaces": BASE,
@@ -76,13 +77,15 @@ ROOMS: dict[str, set[str]] = {
     "experience": BASE | {"spaces", "skills", "envs", "algorithms"},
     "workers": BASE | {"envs", "algorithms", "experience"},
     "runs": BASE | {"algorithms", "skills", "envs"},
-    "planning": BASE
-    | {"ops", "spaces", "skills", "envs", "algorithms", "experience", "workers", "runs"},
+    "calls": BASE
+    | {"ops", "spaces", "skills", "envs", "algorithms", "experience", "runs"}
+    | {"extensions"},
+    "planning": BASE | {"ops", "spaces", "skills", "envs", "calls"},
     "training": LEARNING,
     "hierarchy": LEARNING | {"training"},
     "evolution": LEARNING | {"training"},
     "export": LEARNING | {"training", "hierarchy"},
-    "reporting": BASE | {"spaces", "skills", "envs", "runs", "planning", "training", "hierarchy"},
+    "reporting": BASE | {"spaces", "skills", "envs", "runs", "calls", "training", "hierarchy"},
     "shipped": {"errors"},
     "api": EVERYTHING,
     "types": {"public", "policies", "policy_protocol", "training", "hierarchy", "export"},

@@ -16,8 +16,9 @@ import numpy as np
 from benchmarks.pay.results import CODE, Result, Results
 from benchmarks.plan.families import Family, NewTask, Policies
 from skillweave import Apart, Hierarchy, Run, evaluate
+from skillweave.calls import CallLog, record_calls
 from skillweave.errors import RunError
-from skillweave.planning import CallLog, Explorer, record_calls
+from skillweave.planning import Explorer
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import Evaluation
 

@@ -25,10 +25,10 @@ from benchmarks.pay.results import CODE, Result, of_other_code
 from benchmarks.plan.cells import Cells
 from benchmarks.plan.families import LEGS, lander
 from skillweave import Run
+from skillweave.calls import CallLog, record_calls
+from skillweave.calls.handover import calls_done
 from skillweave.errors import SkillweaveError
 from skillweave.ops.threads import torch_threads
-from skillweave.planning import CallLog, record_calls
-from skillweave.planning.handover import calls_done
 from skillweave.recipes import lander_missions
 from skillweave.types import Array, Memory
 

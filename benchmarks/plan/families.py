@@ -14,7 +14,8 @@ import numpy as np
 from benchmarks.pay import shuttle as shuttle_suite
 from examples import bridge
 from skillweave import Apart, EnvSpec, Hierarchy, Step
-from skillweave.planning import GoalTask, Mission, held
+from skillweave.calls import held
+from skillweave.planning import GoalTask, Mission
 from skillweave.recipes import _cheetah, _mazes, _missions, lander_missions, mazes, shuttle
 from skillweave.types import Array, Evaluation
 

@@ -49,6 +49,9 @@ from skillweave.api.run_calls import RunCalls
 from skillweave.api.running import resume, train
 from skillweave.api.starting import StartFrom
 from skillweave.api.train_options import RepairOptions, TrainOptions
+from skillweave.calls import CallLog, Handover
+from skillweave.calls.record import with_returns
+from skillweave.calls.run_log import handover_json, handover_of
 from skillweave.envs.make import EngineName, EnvSpec
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.evolving import Evolve
@@ -75,10 +78,8 @@ from skillweave.hierarchy.weights import (
     write_agent,
     write_weights,
 )
-from skillweave.planning import CallLog, Handover, Planner
+from skillweave.planning import Planner
 from skillweave.planning.forecast import Forecast, forecast, played
-from skillweave.planning.record import with_returns
-from skillweave.planning.run_log import handover_json, handover_of
 from skillweave.reporting.palette import RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report.single import write_report

@@ -16,17 +16,18 @@ from skillweave._internal.policy_protocol import Policy
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.config import PPO
 from skillweave.api.task_views import OwnSelector, own_skills
+from skillweave.calls import successes
+from skillweave.calls.log import seen_places
+from skillweave.calls.neighbors import FEATURES
+from skillweave.calls.predicates import WORD
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.experience.decisions import as_logits
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.settings import Guide, Selection
-from skillweave.planning import Planner, successes
-from skillweave.planning.calls import seen_places
+from skillweave.planning import Planner
 from skillweave.planning.mission import RESERVED
-from skillweave.planning.neighbors import FEATURES
-from skillweave.planning.predicates import WORD
 from skillweave.planning.task_env import OwnView, Tasked
 from skillweave.runs.initial_policies import Learnt
 from skillweave.skills.skill_set import skills_below

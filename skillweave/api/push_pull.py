@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from skillweave._internal.messages import as_path
+from skillweave.calls.run_log import needed_calls
 from skillweave.errors import RunError, SkillweaveError
-from skillweave.planning.run_log import needed_calls
 from skillweave.reporting.card import write_card
 from skillweave.reporting.plots import plot_run
 from skillweave.runs import hub

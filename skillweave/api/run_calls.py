@@ -7,10 +7,8 @@ from pathlib import Path
 
 from skillweave._internal.messages import shown_path
 from skillweave._internal.policy_protocol import Policy
-from skillweave.envs.make import EnvSpec
-from skillweave.errors import RunError
-from skillweave.planning import CallLog
-from skillweave.planning.run_log import (
+from skillweave.calls import CallLog
+from skillweave.calls.run_log import (
     RECORD,
     joined,
     load_calls,
@@ -18,6 +16,8 @@ from skillweave.planning.run_log import (
     next_seed,
     save_calls,
 )
+from skillweave.envs.make import EnvSpec
+from skillweave.errors import RunError
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.schema import Count, fitted

@@ -20,6 +20,7 @@ from skillweave.api.applying import D, Trained, apply_manifest, differences
 from skillweave.api.continuing import continuable_run, continue_run
 from skillweave.api.starting import starts
 from skillweave.api.train_options import TrainOptions
+from skillweave.calls.recorder import check_size
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.evolution.evolving import check_several, make_learner, plan
@@ -27,7 +28,6 @@ from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.roles import Level, roles_of
 from skillweave.ops.device import normal_tensors
-from skillweave.planning.recorder import check_size
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import called_by, resume_words, saved_words
 from skillweave.runs.directory import First, RunDirectory

@@ -19,6 +19,8 @@ from skillweave.api.loading import declared_in, load_from
 from skillweave.api.planning import lacking_features, mission_words
 from skillweave.api.push_pull import pull_run, push_run
 from skillweave.api.recipe_file import is_env_id
+from skillweave.calls import Handover
+from skillweave.calls.run_log import handover_json, handover_of
 from skillweave.cli import commands
 from skillweave.cli.demo import demo
 from skillweave.cli.output import Result, run_words, save_score
@@ -28,8 +30,7 @@ from skillweave.cli.training_commands import resume, train
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy.recorded import calls_of
 from skillweave.hierarchy.weights import HierarchyHeader, open_weights
-from skillweave.planning import Explorer, Handover, as_task
-from skillweave.planning.run_log import handover_json, handover_of
+from skillweave.planning import Explorer, as_task
 from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison

@@ -10,6 +10,8 @@ from typing import Any, TypeVar
 from skillweave._internal.messages import short, suggest
 from skillweave._internal.paths import AGENT, CRITIC, SELECTOR, join
 from skillweave.algorithms.config import AlgorithmConfig, AlgorithmSettings, alone
+from skillweave.calls.neighbors import check_features
+from skillweave.calls.predicates import named_predicates
 from skillweave.envs.make import Spaces
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.checks import (
@@ -30,8 +32,6 @@ from skillweave.hierarchy.settings import (
     settings_in,
 )
 from skillweave.networks.config import seeing_all
-from skillweave.planning.neighbors import check_features
-from skillweave.planning.predicates import named_predicates
 from skillweave.schema import Positive, check_fields, fitted
 from skillweave.skills import Reflex, Skill, is_trained
 from skillweave.spaces import action_codec, obs_codec

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from skillweave._internal.paths import level_of, name_of
+from skillweave.calls import CallLog, Handover, join
+from skillweave.calls.handover import before_each, calls_done, shown_rate
+from skillweave.calls.predicates import Held, as_event
+from skillweave.calls.record import RandomChoice, with_returns
 from skillweave.envs.make import EnvSpec
 from skillweave.experience.search import NAMED_SHARE, Starts
 from skillweave.hierarchy.assembly import parts_of, policy_at
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles
-from skillweave.planning import CallLog, Handover, join
-from skillweave.planning.handover import before_each, calls_done, shown_rate
-from skillweave.planning.predicates import Held, as_event
-from skillweave.planning.record import RandomChoice, with_returns
 from skillweave.policies.core import Array, Memory, Step, Turn
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.directory import RunDirectory

@@ -20,7 +20,6 @@ from skillweave.hierarchy.schedule import budgets_of, level_stages, stages_of
 from skillweave.hierarchy.select_best import resolve_greedy, select_best
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
-from skillweave.planning import Planner
 from skillweave.runs.command_words import repair_words, resume_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.initial_policies import copy_ready_policy, policy_at_start
@@ -197,8 +196,8 @@ def _ready(roles: Roles, run: RunDirectory) -> dict[str, Policy]:
         policies[path] = as_recorded(policy, source, lambda: None, described)
     for level in roles.levels.values():
         for selector in (level.ready_selector, level.ready_guide):
-            if isinstance(selector, Planner):
-                selector.log.check_environment(level.spec)
+            if selector is not None:
+                selector.check_environment(level.spec)
         if (guide := level.restricting_guide) is not None:
             described = f"{run.path}: the guide" + (f" of {level.path}" if level.path else "")
             recorded = entries[level.path].guide

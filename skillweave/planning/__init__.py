@@ -1,18 +1,27 @@
-"""Tasks without training: logs of calls, what they say about skills, and plans on them.
+"""Tasks without training: what is to be done, and plans on a log of calls.
 
-Begin with ``calls``, the log; ``machine`` says what a task is, and ``planner`` solves it.
+Begin with ``machine``, which says what a task is; ``planner`` solves it. The names of
+``skillweave.calls`` are here, too.
 """
 
-from skillweave.planning.calls import CallLog, join
+from skillweave.calls import (
+    Blame,
+    CallEnds,
+    CallLog,
+    Chain,
+    Handover,
+    Predicate,
+    held,
+    join,
+    record_calls,
+    successes,
+)
 from skillweave.planning.explorer import Explorer
 from skillweave.planning.forecast import Forecast
 from skillweave.planning.goal import GoalTask, reached
-from skillweave.planning.handover import Blame, CallEnds, Chain, Handover
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission import Mission, as_task, either, in_any_order
 from skillweave.planning.planner import Planner
-from skillweave.planning.predicates import Predicate, held, successes
-from skillweave.planning.record import record_calls
 
 __all__ = [
     "Blame",

@@ -7,11 +7,12 @@ from typing import Annotated, Any
 import numpy as np
 
 from skillweave._internal.arguments import checked_names
-from skillweave.planning.calls import CallLog
+from skillweave.calls.log import CallLog
+from skillweave.calls.neighbors import check_features
+from skillweave.calls.record import LearnsWhileRecording
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbors import check_features
-from skillweave.policies.core import Array, Memory, RowPolicy, Turn
+from skillweave.policies.core import Array
 from skillweave.schema import AtLeastOne, Check, Fraction, Positive, fitted
 
 PER_FEATURE = 0.25
@@ -20,7 +21,7 @@ _Temperature = Annotated[float, Check("from 1e-06 to 10", lambda x: 1e-6 <= x <=
 
 
 @checked_names
-class Explorer(RowPolicy):
+class Explorer(LearnsWhileRecording):
     """A selector for ``record_calls`` that prefers calls which differ from the logged ones.
 
     Where the nearest logged call of a skill is further than ``radius``, calling it is worth the
@@ -91,20 +92,10 @@ class Explorer(RowPolicy):
         may = self._graph.may[:, self._graph.choice_of]
         return float((self._graph.after.distance > self._far)[may].mean())
 
-    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
-        """Return choices (k,), sampled."""
-        assert turn.world.rng is not None
-        return self.decide(obs, turn.mask, turn.world.rng)[0]
-
     def decide(
         self, obs: Array, mask: Array | None, rng: np.random.Generator
     ) -> tuple[Array, dict[str, tuple[Array, Array]]]:
-        """Return choices (n,), and goals of logged calls that are made again.
-
-        Returns:
-            Choices, and by skill with goals the rows (k,) with the numbers of their goals (k, G).
-            All other calls are new, and need new goals.
-        """
+        """Return choices (n,), sampled, and goals of logged calls that are made again."""
         graph = self._graph
         if graph is None:
             score = rng.random((len(obs), self._choices))

@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from skillweave.calls.handover import wilson
+from skillweave.calls.log import CallLog
+from skillweave.calls.neighbors import evenly, nearest
 from skillweave.errors import RunError
-from skillweave.planning.calls import CallLog
 from skillweave.planning.graph import are_apart, goal_standard
-from skillweave.planning.handover import wilson
 from skillweave.planning.lacking import names_of, read_log
 from skillweave.planning.machine import RewardMachine, predicates_of
-from skillweave.planning.neighbors import evenly, nearest
 from skillweave.planning.planner import Planner
 from skillweave.policies.core import Array, CallEnd, LastCall, Turn, World
 from skillweave.policies.plan import SOFT, Readings

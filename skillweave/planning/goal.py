@@ -10,9 +10,9 @@ import numpy as np
 
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
+from skillweave.calls.predicates import Predicate
 from skillweave.errors import DeclarationError
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.predicates import Predicate
 from skillweave.policies.core import Array, Step, read_only
 from skillweave.policies.selectors import function_name
 from skillweave.skills.outputs import call_user, checked

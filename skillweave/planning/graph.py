@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 
 from skillweave._internal.notices import notice
+from skillweave.calls.compared import feature_maps
+from skillweave.calls.log import CallLog
+from skillweave.calls.neighbors import Standard, evenly, tie_order
 from skillweave.errors import DeclarationError, RunError
-from skillweave.planning.calls import CallLog
-from skillweave.planning.compared import feature_maps
+from skillweave.planning.fixed import needs_fixed
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.lacking import check_possible, read_log
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbors import Standard, evenly, tie_order
 from skillweave.policies.core import Array, CallEnd
 from skillweave.policies.plan import (
     MOST_COUNTERS,
@@ -92,7 +93,7 @@ class CallGraph:
         neighbors: K.
         skills: for initiation sets in observations that are not in the log; None: those that were
             recorded at the ends of calls.
-        task: the task that will be planned, as far as it is known; see ``compared_places``.
+        task: the task that will be planned, as far as it is known; see ``needs_fixed``.
 
     Raises:
         RunError: the log has less than two calls.
@@ -123,7 +124,8 @@ class CallGraph:
         self.skills = skills
         self.pieces = pieces = _pieces(log, skills)
         known = np.concatenate([log.start, log.end])
-        self.maps = [*feature_maps(log, features, known, task).values()]
+        keep = task is not None and needs_fixed(task, log)
+        self.maps = [*feature_maps(log, features, known, keep_fixed=keep).values()]
         aims = [_standard_goals(log, name) for name in log.skills]
         groups = tuple(self._groups(log.before[pieces.first], aims))
         self.options = Options(groups, tuple(aims), neighbors, log.lengths)

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from skillweave.errors import RunError, SkillError, SkillweaveError
-from skillweave.planning.columns import CallColumns
+from skillweave.calls.columns import CallColumns
+from skillweave.calls.neighbors import Standard
+from skillweave.calls.predicates import Predicate, reads_of
+from skillweave.errors import RunError, SkillweaveError
 from skillweave.planning.machine import Arrow, RewardMachine, predicates_of
-from skillweave.planning.neighbors import Standard
-from skillweave.planning.predicates import Predicate
 from skillweave.policies.core import Array, observed
 from skillweave.policies.plan import Readings
 
@@ -31,17 +31,8 @@ def read_log(task: RewardMachine, log: CallColumns) -> Readings:
         RunError: the task reads a key of ``info`` that was not recorded.
         SkillError: an event or a reward failed, or returned another shape or type.
     """
-    try:
+    with reads_of(log):
         return task.acts.read(log.as_steps())
-    except SkillError as error:
-        cause = error.__cause__
-        key = cause.args[0] if isinstance(cause, KeyError) and cause.args else None
-        if not isinstance(key, str) or key in log.info:
-            raise
-        raise RunError(
-            f"the task reads info[{key!r}], which the log does not have; record it: "
-            f"record_calls(..., info=[{key!r}])"
-        ) from error
 
 
 def check_possible(task: RewardMachine, readings: Readings, log: CallColumns) -> None:

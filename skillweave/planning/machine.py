@@ -16,8 +16,8 @@ from gymnasium.spaces import Box
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, suggest
 from skillweave._internal.rewards import LARGEST_REWARD
+from skillweave.calls.predicates import Event, Held, Predicate, as_event, predicate_of
 from skillweave.errors import DeclarationError
-from skillweave.planning.predicates import Event, Held, Predicate, as_event, predicate_of
 from skillweave.policies.core import Array, Step
 from skillweave.policies.plan import Machine
 from skillweave.policies.selectors import function_name

@@ -11,10 +11,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, suggest
-from skillweave.errors import DeclarationError
-from skillweave.planning.goal import GoalTask
-from skillweave.planning.machine import MOST_STATES, Arrow, RewardMachine
-from skillweave.planning.predicates import (
+from skillweave.calls.predicates import (
     LONGEST_HOLD,
     Event,
     Held,
@@ -24,6 +21,9 @@ from skillweave.planning.predicates import (
     named_predicates,
     predicate_of,
 )
+from skillweave.errors import DeclarationError
+from skillweave.planning.goal import GoalTask
+from skillweave.planning.machine import MOST_STATES, Arrow, RewardMachine
 from skillweave.schema import AtLeastOne, fitted
 
 DONE = "done"

@@ -14,15 +14,15 @@ import numpy as np
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave._internal.notices import notice
+from skillweave.calls.columns import columns_of
+from skillweave.calls.log import CallLog
+from skillweave.calls.neighbors import check_features
 from skillweave.errors import DeclarationError, RunError
-from skillweave.planning.calls import CallLog
-from skillweave.planning.columns import columns_of
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph, planning_states
 from skillweave.planning.lacking import asks_nothing, obstacle
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission import as_task
-from skillweave.planning.neighbors import check_features
 from skillweave.policies.core import Array
 from skillweave.policies.plan import Near
 from skillweave.policies.planned import Planned
@@ -163,6 +163,10 @@ class Planner(ReadySelector):
             self.obstacle = obstacle(self.task, log)
         elif self.observed is None:
             self.plan = self._solve(self.task.at(self.task.goal))
+
+    def check_environment(self, spec: Any) -> None:
+        """Give a notice where the log is of another environment, or the environment has changed."""
+        self.log.check_environment(spec)
 
     @cached_property
     def in_place(self) -> Planned:  # type: ignore[override]

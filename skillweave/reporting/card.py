@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
-from skillweave.planning.run_log import handover_of
+from skillweave.calls.run_log import handover_of
 from skillweave.reporting.report.curves import reached_steps, read_curves
 from skillweave.reporting.report.facts import WHY, WORDS, facts, plain, stage_rows
 from skillweave.runs.directory import RunDirectory

@@ -6,7 +6,7 @@ lineage.jsonl                a line for every member of every generation, of pop
 evaluation.json              the latest evaluation (``training/evaluation_file.py``)
 evaluation-sampled.json      the latest evaluation that sampled actions on request
 checkpoint.safetensors       the latest checkpoint of the stage in training (and the one before)
-calls.safetensors            calls of the skills (``planning/run_log.py``)
+calls.safetensors            calls of the skills (``calls/run_log.py``)
 policies/<stage>.safetensors policies of finished stages
 states/<name>.safetensors    states of learners that continue in a later stage, until that is done
 replay/<skill>.safetensors   steps of a skill that shares its replay, until the last one is done

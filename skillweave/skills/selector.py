@@ -87,6 +87,13 @@ class ReadySelector(Functional, Foreign):
             rule.number(name, f": {where}", DeclarationError)
         return selector
 
+    def check_environment(self, spec: Any) -> None:
+        """Give a notice where it was made for another environment than it acts in.
+
+        Args:
+            spec: an ``EnvSpec``, the environment in which it acts.
+        """
+
     @property
     def goal_spaces(self) -> dict[str, Space[Any]]:
         """Return the spaces of goals of the skills that have some, by name, once it is bound."""

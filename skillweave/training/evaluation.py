@@ -20,13 +20,13 @@ from skillweave._internal.notices import notice
 from skillweave._internal.policy_protocol import Policy
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave._internal.terminal import printable
+from skillweave.calls.log import CallLog
 from skillweave.envs.checked import longest_evaluation, time_limit
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.env_infos import notice_odd_success, reported_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.envs.pool import POOL_SEEDS
 from skillweave.errors import DeclarationError, SkillweaveError
-from skillweave.planning.calls import CallLog
 from skillweave.policies.core import Array
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.schema import UNSAVED, AtLeastOne, Count, fitted

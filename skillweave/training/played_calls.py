@@ -11,11 +11,11 @@ import numpy as np
 
 from skillweave._internal.paths import AGENT, join, level_of, names_in
 from skillweave._internal.policy_protocol import Memory, Policy
+from skillweave.calls.columns import GOAL, OF_CALL
+from skillweave.calls.log import CallLog
+from skillweave.calls.recorder import SUMS, Recorder, TraceFeed, calls_in, goals_in, levels_below
 from skillweave.envs.make import EnvSpec
 from skillweave.experience.views import seen_by, stops
-from skillweave.planning.calls import CallLog
-from skillweave.planning.columns import GOAL, OF_CALL
-from skillweave.planning.recorder import SUMS, Recorder, TraceFeed, calls_in, goals_in, levels_below
 from skillweave.policies.core import EPISODE, LIMIT, OWN, RUNNING, Array, end_with_episode
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills import Reflex, Skill, call_method

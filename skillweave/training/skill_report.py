@@ -10,15 +10,15 @@ import numpy as np
 
 from skillweave._internal.messages import aligned
 from skillweave._internal.paths import join, level_of
-from skillweave.planning.columns import (
+from skillweave.calls.columns import (
     ENDS,
     began_late,
     limits_of_choices,
     time_limit_of,
     whole_steps,
 )
-from skillweave.planning.handover import FEW, LEAST, Handover, pair_counts
-from skillweave.planning.recorder import Recorder
+from skillweave.calls.handover import FEW, LEAST, Handover, pair_counts
+from skillweave.calls.recorder import Recorder
 from skillweave.policies.core import Array, CallEnd
 from skillweave.schema import Check, Count
 from skillweave.skills import is_trained

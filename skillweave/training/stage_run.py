@@ -11,7 +11,7 @@ from torch import Tensor
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
-from skillweave.planning.recorder import Recorder
+from skillweave.calls.recorder import Recorder
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import StageEntry
 from skillweave.training.learning_task import LearningTask

@@ -12,8 +12,8 @@ from skillweave._internal.paths import names_in
 from skillweave._internal.policy_protocol import Policy
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.algorithms.agent_policy import AgentPolicy
-from skillweave.planning.recorder import Recorder
-from skillweave.planning.run_log import save_calls
+from skillweave.calls.recorder import Recorder
+from skillweave.calls.run_log import save_calls
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint, StageEntry
 from skillweave.runs.trackers import Listener

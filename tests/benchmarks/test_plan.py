@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from line_world import TINY, Line
-from planning.logs import log_of
+from call_logs.logs import log_of
 
 from benchmarks.pay.results import Result
 from benchmarks.plan import __main__ as command

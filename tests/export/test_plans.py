@@ -14,18 +14,11 @@ from ready_selectors.chain import DOOR, PLACE, Corridor, GetKey, Leave, OpenDoor
 
 from skillweave import EnvSpec, Lengths
 from skillweave.api.player import Player
+from skillweave.calls import CallLog, held, record_calls
 from skillweave.errors import PolicyError, SkillError
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.planning import (
-    CallLog,
-    GoalTask,
-    Mission,
-    Planner,
-    RewardMachine,
-    held,
-    record_calls,
-)
+from skillweave.planning import GoalTask, Mission, Planner, RewardMachine
 from skillweave.policies.codec import read_folder
 from skillweave.policies.core import Turn, World
 from skillweave.policies.hierarchy import ActiveGuide

@@ -7,9 +7,9 @@ import pytest
 from goals.worlds import Rest, declared, go_to, ready, walk
 
 import skillweave as sw
+from skillweave.calls import CallLog, join
 from skillweave.errors import RunError
 from skillweave.hierarchy.repair import rehearsed_obs
-from skillweave.planning import CallLog, join
 from skillweave.skills.goals import goals_of
 
 

@@ -8,12 +8,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from goals.worlds import Point, Rest, declared, go_to, place_of, ready
-from planning.logs import jumps, log_of
+from call_logs.logs import jumps, log_of
 from planning.steps import assert_not_repeated, at
 
 import skillweave as sw
+from skillweave.calls import Predicate
 from skillweave.errors import DeclarationError, RunError
-from skillweave.planning import Explorer, Mission, Planner, Predicate
+from skillweave.planning import Explorer, Mission, Planner
 from skillweave.planning.graph import CallGraph
 from skillweave.skills.goal_spaces import choice_space
 

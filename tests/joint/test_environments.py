@@ -13,8 +13,8 @@ from small_runs import goes_on, reports_every
 from torch import nn
 
 import skillweave as sw
+from skillweave.calls import CallLog
 from skillweave.export.runner import Runner
-from skillweave.planning import CallLog
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.plain_agent import load_agent_of
 

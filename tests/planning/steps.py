@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.planning import Planner, Predicate
+from skillweave.calls import Predicate
+from skillweave.planning import Planner
 from skillweave.policies.core import LIMIT, flat, nested
 from skillweave.skills import LastCall, ReadySelector
 from skillweave.types import Array, Step

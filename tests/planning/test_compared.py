@@ -7,10 +7,11 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
-from planning.logs import log_of
+from call_logs.logs import log_of
 
-from skillweave.planning import CallLog, GoalTask, Planner
-from skillweave.planning.compared import compared_places
+from skillweave.calls import CallLog
+from skillweave.calls.compared import compared_places
+from skillweave.planning import GoalTask, Planner
 
 
 def walks(to_goal: bool, episodes: int = 60) -> CallLog:

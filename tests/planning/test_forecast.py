@@ -6,18 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planning.logs import jumps, log_of
+from call_logs.logs import jumps, log_of
 from planning.steps import at
 
-from skillweave.planning import (
-    CallLog,
-    GoalTask,
-    Mission,
-    Planner,
-    RewardMachine,
-    either,
-    held,
-)
+from skillweave.calls import CallLog, held
+from skillweave.planning import GoalTask, Mission, Planner, RewardMachine, either
 from skillweave.planning.forecast import forecast
 from skillweave.planning.lacking import asks_nothing
 

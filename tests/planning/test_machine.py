@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 from planning.steps import column, step_to, watched
 
+from skillweave.calls import Predicate, held, successes
 from skillweave.errors import DeclarationError, SkillError
-from skillweave.planning import (
-    Mission,
-    Predicate,
-    RewardMachine,
-    held,
-    in_any_order,
-    successes,
-)
+from skillweave.planning import Mission, RewardMachine, in_any_order
 from skillweave.skills import LastCall, Skill
 
 A, B, C = (column(i) for i in range(3))

@@ -9,15 +9,14 @@ import pytest
 from hypothesis import given, strategies as st
 from planning.steps import column, step_to
 
+from skillweave.calls import Predicate, held
 from skillweave.errors import DeclarationError
 from skillweave.planning import (
     GoalTask,
     Mission,
-    Predicate,
     RewardMachine,
     as_task,
     either,
-    held,
     in_any_order,
     reached,
 )

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from planning.untrained import run_of
+from call_logs.untrained import run_of
 from ready_selectors.chain import PLACE, GetKey, OpenDoor, Wait, at_four
 
 from skillweave.errors import DeclarationError

@@ -8,11 +8,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from planning.logs import log_of
+from call_logs.logs import log_of
 from planning.steps import at, step_to
 
+from skillweave.calls import CallLog, held
 from skillweave.errors import PolicyError, SkillError
-from skillweave.planning import CallLog, GoalTask, Mission, Planner, RewardMachine, held
+from skillweave.planning import GoalTask, Mission, Planner, RewardMachine
 from skillweave.policies.core import LastCall, Turn, World, flat
 from skillweave.policies.planned import Planned
 from skillweave.skills.goal_spaces import choice_space

@@ -9,9 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from goals.worlds import Point
-from planning.logs import log_of
+from call_logs.logs import log_of
 from planning.steps import assert_not_repeated, at, step_to, watched
-from planning.untrained import SKILLS, skill_set
+from call_logs.untrained import SKILLS, skill_set
 from ready_selectors.chain import (
     DOOR,
     KEY,
@@ -24,21 +24,11 @@ from ready_selectors.chain import (
 from toys import skills_of
 
 from skillweave import EnvSpec, Hierarchy, evaluate
+from skillweave.calls import CallLog, Predicate, held, record_calls
+from skillweave.calls.neighbors import nearest, tie_order
 from skillweave.errors import DeclarationError, RunError, SkillError
-from skillweave.planning import (
-    CallLog,
-    Explorer,
-    GoalTask,
-    Mission,
-    Planner,
-    Predicate,
-    RewardMachine,
-    either,
-    held,
-    record_calls,
-)
+from skillweave.planning import Explorer, GoalTask, Mission, Planner, RewardMachine, either
 from skillweave.planning.graph import LEVELS, exact_states, planning_states
-from skillweave.planning.neighbors import nearest, tie_order
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import nearest_corner
 from skillweave.skills import LastCall, Skill

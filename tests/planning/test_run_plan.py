@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from planning.untrained import run_of
+from call_logs.untrained import run_of
 from ready_selectors.chain import (
     PLACE,
     SPEC,
@@ -19,17 +19,9 @@ from ready_selectors.chain import (
 
 import skillweave as sw
 from skillweave.api import Run
+from skillweave.calls import CallLog, held, join
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
-from skillweave.planning import (
-    CallLog,
-    Explorer,
-    GoalTask,
-    Mission,
-    RewardMachine,
-    held,
-    join,
-    reached,
-)
+from skillweave.planning import Explorer, GoalTask, Mission, RewardMachine, reached
 from skillweave.planning.mission import as_task
 from skillweave.planning.task_env import Tasked, TaskEnv
 

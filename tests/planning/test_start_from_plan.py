@@ -5,9 +5,9 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
-from planning.logs import log_of
+from call_logs.logs import log_of
 from planning.steps import step_to, watched
-from planning.untrained import run_of
+from call_logs.untrained import run_of
 from ready_selectors.chain import (
     DOOR,
     KEY,
@@ -28,9 +28,10 @@ from small_runs import lines
 
 import skillweave as sw
 from skillweave.api import Run
+from skillweave.calls import held
 from skillweave.errors import DeclarationError, EnvError, SkillweaveError
 from skillweave.networks.config import RNN, Network
-from skillweave.planning import GoalTask, Mission, Planner, held
+from skillweave.planning import GoalTask, Mission, Planner
 from skillweave.planning.mission import as_task
 from skillweave.planning.task_env import OwnView, Tasked
 from skillweave.policies.core import CallEnd

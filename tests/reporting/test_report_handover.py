@@ -12,7 +12,7 @@ import pytest
 from reporting.walkway import Walkway, declare
 
 from skillweave import EnvSpec
-from skillweave.planning import CallLog
+from skillweave.calls import CallLog
 from skillweave.reporting.report import film, matrix as page
 from skillweave.reporting.report.film import HOLD
 from skillweave.reporting.report.matrix import add_handover

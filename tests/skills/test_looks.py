@@ -14,8 +14,9 @@ from torch import nn
 
 import skillweave as sw
 from skillweave._internal.notices import collected_notices
+from skillweave.calls import Predicate
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
-from skillweave.planning import GoalTask, Predicate
+from skillweave.planning import GoalTask
 from skillweave.skills import Skill, call_method
 from skillweave.types import Step
 

@@ -14,9 +14,10 @@ from gymnasium.spaces import Box, Discrete
 
 from skillweave import tree
 from skillweave._internal.notices import collected_notices
+from skillweave.calls import Predicate
 from skillweave.errors import DeclarationError, PolicyError, SkillError
 from skillweave.experience.judges import SkillJudge
-from skillweave.planning import GoalTask, Predicate, RewardMachine
+from skillweave.planning import GoalTask, RewardMachine
 from skillweave.policies.core import LastCall, Turn, World
 from skillweave.policies.spaces import space_of
 from skillweave.skills import Automaton, Reflex, Skill, call_method, from_function, ready_selector

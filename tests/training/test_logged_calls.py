@@ -14,12 +14,12 @@ from small_runs import (
 )
 
 from skillweave import EnvSpec, Hierarchy, Lengths, Run, Skill, TrainDefaults
+from skillweave.calls import CallLog
+from skillweave.calls.columns import columns_of
+from skillweave.calls.log import LEARNING
 from skillweave.errors import DeclarationError, EnvError, RunError
 from skillweave.evolution import Evolution
 from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.planning import CallLog
-from skillweave.planning.calls import LEARNING
-from skillweave.planning.columns import columns_of
 from skillweave.policies.core import CallEnd
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.workers import Ray, placement

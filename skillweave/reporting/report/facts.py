@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 from skillweave._internal.paths import level_of
-from skillweave.planning.handover import wilson
+from skillweave.calls.handover import wilson
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import LevelEntry, StageEntry

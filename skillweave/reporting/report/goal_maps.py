@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.paths import join
-from skillweave.planning import CallLog
+from skillweave.calls import CallLog
 from skillweave.policies.core import Array
 from skillweave.reporting.report import charts
 from skillweave.reporting.report.facts import percent

@@ -10,13 +10,13 @@ import numpy as np
 
 from skillweave._internal.messages import short
 from skillweave._internal.seeding import Seeds, global_generators
+from skillweave.calls import CallLog, Handover
+from skillweave.calls.handover import CallEnds, before_each
+from skillweave.calls.neighbors import evenly
 from skillweave.envs.engine import RawStep
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import EnvError
-from skillweave.planning import CallLog, Handover
-from skillweave.planning.handover import CallEnds, before_each
-from skillweave.planning.neighbors import evenly
 from skillweave.policies.core import Array
 from skillweave.policies.spaces import space_of
 from skillweave.reporting.report import charts

@@ -11,10 +11,10 @@ from typing import Any
 from skillweave._internal.paths import AGENT
 from skillweave._internal.policy_protocol import Policy
 from skillweave._internal.seeding import Seeds, global_generators
+from skillweave.calls.columns import ENDS
+from skillweave.calls.handover import wilson
+from skillweave.calls.run_log import load_calls
 from skillweave.envs.make import EnvSpec
-from skillweave.planning.columns import ENDS
-from skillweave.planning.handover import wilson
-from skillweave.planning.run_log import load_calls
 from skillweave.reporting.lineage import read_lineage, setting_title, short_value
 from skillweave.reporting.palette import RGB, color_of, hex_of, is_light
 from skillweave.reporting.progress import EpisodeProgress

@@ -3,61 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from skillweave._internal.messages import short, suggest
+from skillweave.calls.columns import CallColumns
+from skillweave.calls.neighbors import FeatureMap, Standard, evenly, nearest
 from skillweave.errors import DeclarationError
-from skillweave.planning.columns import CallColumns
-from skillweave.planning.lacking import read_log
-from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbors import FeatureMap, Standard, evenly, nearest
 from skillweave.policies.core import Array
-from skillweave.spaces import leaves, obs_codec
+from skillweave.spaces import obs_codec
 
 MOST_STEPS = 0.5
 """The share of steps in which a number has to change to be compared, if a skill does not see it."""
 FEWEST = 30
 """Calls of a skill from which on it is measured whether a number says where they end."""
 MOST = 2_000
-"""The most calls that this is measured by."""
+"""The most calls, or steps, that this is measured by."""
 NEIGHBORS = 5
 BETTER = 0.95
 """The error of predicted ends, relative to that without some numbers, below which they help."""
-READ = 2_000
-"""The steps by which it is measured whether a task reads a number."""
 
 Places = Sequence[int] | None
 
 
-def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tuple[Places, ...]:
+def fixed_places(log: CallColumns) -> list[int]:
+    """Return the numbers that differ between episodes and never change within one.
+
+    They are places in the flat observation, such as those of an episode's goal. Where skills see
+    images alone, there are none.
+    """
+    if _sees_images(log):
+        return []
+    before = log.flat(log.before)
+    still = (before == log.flat(log.next_obs)).all(0)
+    return np.flatnonzero(still & Standard(before).varies).tolist()
+
+
+def compared_places(log: CallColumns, *, keep_fixed: bool = False) -> tuple[Places, ...]:
     """Return the places by which calls of each skill are compared; None: all.
 
     They are the places that the skill sees, and those that change in most steps, as a position
     does: these say where a call ends though the skill does not see them, behind which wall, for
     example. A number that differs between episodes and never changes within one, as the place of a
-    goal, only divides the log: it counts where it helps to predict where the skill's calls end, or
-    where the task reads it, or reads a reward, ``info`` or an end that it helps to predict.
+    goal, only divides the log: it counts where it helps to predict where the skill's calls end.
 
     Args:
         log: the calls.
-        task: the planned task; None: the numbers are for any.
+        keep_fixed: these numbers count in any case, as what is planned depends on them.
     """
-    space = log.observation_space
-    codec = obs_codec(space)
-    if codec.images and all(seen is None for seen in log.sees):
+    if _sees_images(log):
         return tuple(log.sees)
+    codec = obs_codec(log.observation_space)
     before, after = log.flat(log.before), log.flat(log.next_obs)
     changes = (before != after).mean(0)
     varies = Standard(before).varies
-    fixed = np.flatnonzero((changes == 0) & varies).tolist()
+    fixed = [] if keep_fixed else np.flatnonzero((changes == 0) & varies).tolist()
     moves = np.flatnonzero(changes > MOST_STEPS).tolist()
-    if fixed and task is not None:
-        free = [place for place in np.flatnonzero(varies).tolist() if place not in fixed]
-        if _reads_fixed(task, log) or _pays_by(task, log, after, free, fixed):
-            fixed = []
     start = before[log.offset[:-1]]
     end = after[log.offset[1:] - 1]
     places: list[Places] = []
@@ -79,7 +81,8 @@ def feature_maps(
     log: CallColumns,
     features: Any,
     known: Array,
-    task: RewardMachine | None = None,
+    *,
+    keep_fixed: bool = False,
     skills: Sequence[int] | None = None,
 ) -> dict[int, FeatureMap]:
     """Return the features by which a log's calls are compared, by their skills' places.
@@ -88,10 +91,10 @@ def feature_maps(
         log: the calls.
         features: for all skills, or by skill; None: the log's own, else the ``compared_places``.
         known: logged observations.
-        task: see ``compared_places``.
+        keep_fixed: see ``compared_places``.
         skills: the places of those that are compared; None: all.
     """
-    places = compared_places(log, task)
+    places = compared_places(log, keep_fixed=keep_fixed)
     names = log.skills
     features = log.features if features is None else features
     by_skill = features if isinstance(features, Mapping) else dict.fromkeys(names, features)
@@ -111,6 +114,12 @@ def feature_maps(
     }
 
 
+def _sees_images(log: CallColumns) -> bool:
+    """Return whether observations have images, and every skill may see them."""
+    images = obs_codec(log.observation_space).images
+    return bool(images) and all(seen is None for seen in log.sees)
+
+
 def _help(
     log: CallColumns, skill: int, start: Array, end: Array, rest: list[int], more: list[int]
 ) -> bool:
@@ -126,31 +135,11 @@ def _help(
     def points(places: list[int]) -> Array:
         return np.concatenate([start[rows][:, places], own], 1)
 
-    return _predict(points(rest), points([*rest, *more]), moved)
+    return predict_better(points(rest), points([*rest, *more]), moved)
 
 
-def _pays_by(
-    task: RewardMachine, log: CallColumns, after: Array, rest: list[int], more: list[int]
-) -> bool:
-    """Return whether ``more`` numbers beside ``rest`` help to predict what a task reads of steps.
-
-    The environment's reward, ``info`` and ends may follow from numbers that the task does not read.
-
-    Raises:
-        RunError: see ``read_log``.
-    """
-    if not rest or not (task.rewards or any(event.reads != "obs" for event in task.events)):
-        return False
-    known = read_log(task, log)
-    read = np.concatenate([known.events, known.values], 1)
-    odd = (read != np.median(read, 0)).any(1)  # seldom steps, as those that pay, count as much
-    rows = np.concatenate([evenly(np.flatnonzero(some), MOST // 2) for some in (odd, ~odd)])
-    at = after[rows]
-    return len(rows) > FEWEST and _predict(at[:, rest], at[:, [*rest, *more]], read[rows])
-
-
-def _predict(few: Array, many: Array, values: Array) -> bool:
-    """Return whether points ``many`` (n, F) predict values (n, D) better than ``few``."""
+def predict_better(few: Array, many: Array, values: Array) -> bool:
+    """Return whether points ``many`` (n, F) predict values (n, D) better than ``few`` (n, G)."""
     wanted = Standard(values)(values)
 
     def error(seen: Array) -> float:
@@ -162,26 +151,3 @@ def _predict(few: Array, many: Array, values: Array) -> bool:
         return float(np.square(mean - wanted).mean())
 
     return error(many) < BETTER * error(few)
-
-
-def _reads_fixed(task: RewardMachine, log: CallColumns) -> bool:
-    """Return whether a task is another one with another episode's fixed numbers.
-
-    Raises:
-        RunError: see ``read_log``.
-    """
-    rng = np.random.default_rng(0)
-    calls = rng.permutation(len(log))
-    few = log.take(calls[: np.searchsorted(np.cumsum(log.tau[calls]), READ) + 1])
-    start, inside = few.start.copy(), few.next_obs.copy()
-    other = few.next_obs[rng.permutation(few.steps)]
-    for own, new in ((start, other[few.offset[:-1]]), (inside, other)):
-        arrays = (log.before, log.next_obs, own, new)
-        for first, then, mine, others in zip(*map(leaves, arrays), strict=True):
-            np.copyto(mine, others, where=(first == then).all(0))
-    changed = read_log(task, replace(few, start=start, next_obs=inside))
-    known = read_log(task, few)
-    return not (
-        np.array_equal(known.events, changed.events)
-        and np.array_equal(known.values, changed.values)
-    )

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planning.logs import log_of
+from call_logs.logs import log_of
 
+from skillweave.calls import CallLog, held
+from skillweave.calls.handover import Handover, _chance_of_fewer, wilson
 from skillweave.errors import DeclarationError, RunError
-from skillweave.planning import CallLog, held
-from skillweave.planning.handover import Handover, _chance_of_fewer, wilson
 
 A, B = 0, 1
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from logs import log_of
+from call_logs.logs import log_of
 
+from skillweave.calls import Blame, CallLog
 from skillweave.errors import RunError
-from skillweave.planning import Blame, CallLog
 
 A, B = 0, 1
 

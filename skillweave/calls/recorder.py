@@ -17,12 +17,12 @@ import numpy as np
 from skillweave._internal.paths import join
 from skillweave._internal.policy_protocol import Memory
 from skillweave.algorithms.batches import INFO, OF_STEP, Batch, Trace
+from skillweave.calls.columns import GOAL, call_fields, fields_of
+from skillweave.calls.log import CallLog, seen_places, skill_checksums, skill_code
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.experience.views import OwnSteps, call_successes, info_numbers_of
 from skillweave.experience.writer import TraceWriter
-from skillweave.planning.calls import CallLog, seen_places, skill_checksums, skill_code
-from skillweave.planning.columns import GOAL, call_fields, fields_of
 from skillweave.policies.core import LIMIT, RUNNING, Array, Step
 from skillweave.runs.user_code import Texts, environment_texts
 from skillweave.skills.base import RecordedSkill

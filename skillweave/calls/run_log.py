@@ -13,12 +13,12 @@ import numpy as np
 from skillweave._internal.messages import shown_path
 from skillweave._internal.notices import notice
 from skillweave._internal.paths import CRITIC, SELECTOR
+from skillweave.calls.call_file import LoggedRun, write_calls
+from skillweave.calls.columns import columns_of
+from skillweave.calls.handover import Handover
+from skillweave.calls.log import CallLog, join
+from skillweave.calls.recorder import MOST_BYTES
 from skillweave.errors import RunError
-from skillweave.planning.call_file import LoggedRun, write_calls
-from skillweave.planning.calls import CallLog, join
-from skillweave.planning.columns import columns_of
-from skillweave.planning.handover import Handover
-from skillweave.planning.recorder import MOST_BYTES
 from skillweave.policies.untrusted import check_file
 from skillweave.runs.directory import CALLS, CALLS_LOCK, RunDirectory
 from skillweave.runs.files import read_header

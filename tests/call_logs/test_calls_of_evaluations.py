@@ -22,10 +22,10 @@ from ready_selectors.chain import (
 from toys import skills_of
 
 from skillweave import Automaton, EnvSpec, Lengths
+from skillweave.calls import CallLog, record_calls
+from skillweave.calls.columns import columns_of
 from skillweave.errors import DeclarationError, EnvError
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
-from skillweave.planning import CallLog, record_calls
-from skillweave.planning.columns import columns_of
 from skillweave.policies.core import CallEnd
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy

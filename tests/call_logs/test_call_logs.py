@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 from goals.worlds import Point
-from planning.untrained import SKILLS, skill_set
+from call_logs.untrained import SKILLS, skill_set
 from ready_selectors.chain import DOOR, KEY, LAST, NAMES, SPEC, hierarchy
 from toys import skills_of
 
 from skillweave import Automaton, EnvSpec, Lengths
+from skillweave.calls import CallLog, join, record_calls
+from skillweave.calls.columns import columns_of
 from skillweave.errors import DeclarationError, EnvError, RunError
-from skillweave.planning import CallLog, join, record_calls
-from skillweave.planning.columns import columns_of
 from skillweave.policies.core import CallEnd
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.skills import Skill

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.planning import CallLog
+from skillweave.calls import CallLog
 from skillweave.policies.core import CallEnd
 
 WHY = {"own": CallEnd.OWN, "limit": CallEnd.LIMIT, "end": CallEnd.EPISODE, "cut": CallEnd.EPISODE}

@@ -7,11 +7,11 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
-from planning.logs import log_of
+from call_logs.logs import log_of
 
 from skillweave import Hierarchy, Skill, evaluate
+from skillweave.calls import CallLog, held, join
 from skillweave.errors import RunError
-from skillweave.planning import CallLog, held, join
 
 A, B = 0, 1
 LIMIT = 10

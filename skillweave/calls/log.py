@@ -11,11 +11,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.calls.call_file import read_calls, write_calls
+from skillweave.calls.columns import columns_of, fields_of
+from skillweave.calls.handover import LinkedCalls
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, RunError
-from skillweave.planning.call_file import read_calls, write_calls
-from skillweave.planning.columns import columns_of, fields_of
-from skillweave.planning.handover import LinkedCalls
 from skillweave.policies.untrusted import checksum
 from skillweave.runs.user_code import (
     Texts,

@@ -13,13 +13,11 @@ import numpy as np
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import aligned, short, suggest
 from skillweave._internal.notebooks import table
+from skillweave.calls.columns import CallColumns
+from skillweave.calls.compared import feature_maps
+from skillweave.calls.neighbors import Standard, nearest
+from skillweave.calls.predicates import Event, Held, as_event, predicate_of, reads_of
 from skillweave.errors import DeclarationError, RunError
-from skillweave.planning.columns import CallColumns
-from skillweave.planning.compared import feature_maps
-from skillweave.planning.lacking import read_log
-from skillweave.planning.mission import Mission
-from skillweave.planning.neighbors import Standard, nearest
-from skillweave.planning.predicates import Event, Held, as_event
 from skillweave.policies.core import Array, CallEnd
 from skillweave.policies.plan import weights_of
 from skillweave.schema import fitted
@@ -442,8 +440,9 @@ def calls_done(log: CallColumns, done: Mapping[str, Any] | None) -> Array:
 def happened(log: CallColumns, event: Event) -> Array:
     """Return the calls within which an event happened, (C,) bool."""
     steps = event.steps if isinstance(event, Held) else 1
-    # By step, how often it held so far; the predicate is the first of the task's events.
-    count = np.cumsum(np.pad(read_log(Mission(event), log).events[:, 0], (steps, 0)))
+    with reads_of(log):
+        holds = predicate_of(event).holds(log.as_steps())
+    count = np.cumsum(np.pad(holds, (steps, 0)))  # by step, how often it held so far
     full = (count[steps:] - count[:-steps] == steps) & (log.elapsed >= steps)
     found: Array = np.bincount(log.owner[full], minlength=len(log)) > 0
     return found

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -13,7 +14,8 @@ import numpy as np
 
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
-from skillweave.errors import DeclarationError, SkillError
+from skillweave.calls.columns import CallColumns
+from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.policies.core import Array, Step
 from skillweave.policies.selectors import function_name
 from skillweave.schema import AtLeastOne, fitted
@@ -195,6 +197,26 @@ def named_predicates(values: Mapping[str, Any], where: str) -> dict[str, Event]:
             event = Predicate(event.function, name, event.reads)
         named[name] = event
     return named
+
+
+@contextmanager
+def reads_of(log: CallColumns) -> Iterator[None]:
+    """Raise a RunError where a predicate, asked inside, reads ``info`` that the log does not have.
+
+    Raises:
+        RunError: the key, and how to record it.
+    """
+    try:
+        yield
+    except SkillError as error:
+        cause = error.__cause__
+        key = cause.args[0] if isinstance(cause, KeyError) and cause.args else None
+        if not isinstance(key, str) or key in log.info:
+            raise
+        raise RunError(
+            f"the task reads info[{key!r}], which the log does not have; record it: "
+            f"record_calls(..., info=[{key!r}])"
+        ) from error
 
 
 @checked_names

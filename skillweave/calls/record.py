@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import replace
@@ -11,16 +12,16 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.arguments import checked_names
+from skillweave._internal.extensions import fetch
 from skillweave._internal.interrupts import deferred, requested
 from skillweave._internal.messages import short
 from skillweave._internal.seeding import Seeds, global_generators
+from skillweave.calls.log import CallLog
+from skillweave.calls.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
 from skillweave.envs.engine import Engine, GymnasiumEngine, episode_seed
 from skillweave.envs.env_infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError, Interrupted
-from skillweave.planning.calls import CallLog
-from skillweave.planning.explorer import Explorer
-from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
 from skillweave.policies.core import (
     Around,
     Array,
@@ -55,6 +56,40 @@ class RandomChoice(RowPolicy):
         score = turn.world.rng.random((len(obs), self.choices))
         best = score if turn.mask is None else np.where(turn.mask, score, -1.0)
         return np.asarray(best.argmax(1))
+
+
+class LearnsWhileRecording(RowPolicy):
+    """A selector for ``record_calls`` that learns from the calls so far."""
+
+    every: int
+    """The steps after which it learns again."""
+
+    @abstractmethod
+    def begin(self, choices: int) -> None:
+        """Prepare for a recording; ``choices``: of a selector, skills times lengths."""
+
+    @abstractmethod
+    def learn(self, log: CallLog) -> None:
+        """Learn from the calls so far."""
+
+    @abstractmethod
+    def decide(
+        self, obs: Array, mask: Array | None, rng: np.random.Generator
+    ) -> tuple[Array, dict[str, tuple[Array, Array]]]:
+        """Return choices (n,), and goals of logged calls that are made again.
+
+        Args:
+            mask: (n, choices) bool, what may start; None: all.
+
+        Returns:
+            Choices, and by skill with goals the rows (k,) with the numbers of their goals (k, G).
+            All other calls are new, and need new goals.
+        """
+
+    def act(self, memory: InPlaceMemory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return choices (k,)."""
+        assert turn.world.rng is not None
+        return self.decide(obs, turn.mask, turn.world.rng)[0]
 
 
 @checked_names
@@ -120,8 +155,10 @@ def with_returns(
         )
     fitted(Sequence[str], info, "info")
     if isinstance(choose, str):
-        known = {"random": RandomChoice(skill_set.choices), "explore": Explorer()}
-        choose = known.get(choose, choose)
+        if choose == "random":
+            choose = RandomChoice(skill_set.choices)
+        elif choose == "explore":
+            choose = fetch("explore")()
     skill_set = replace(skill_set, interruption=None)  # it belongs to a selector that is left out
     spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
     seeds = Seeds(seed) / "calls"
@@ -159,7 +196,7 @@ def with_returns(
 class WithDrawnGoals(Around):
     """A selector of skills alone, with goals that are drawn as for practice.
 
-    An ``Explorer`` also repeats goals of logged calls.
+    One that learns while it records also repeats goals of logged calls.
 
     Args:
         selector: chooses skills.
@@ -179,7 +216,7 @@ class WithDrawnGoals(Around):
         rng = turn.world.rng
         again = dict[str, tuple[Array, Array]]()
         assert rng is not None
-        if isinstance(self._selector, Explorer):
+        if isinstance(self._selector, LearnsWhileRecording):
             number, again = self._selector.decide(obs, turn.mask, rng)
         else:
             number = super().act(memory, rows, obs, turn)
@@ -199,7 +236,7 @@ def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
     """Return the acting selector that ``choose`` means, for the skills in an engine."""
     names = tuple(s.name for s in skills.skills)
     choices = skills.choice_space
-    if isinstance(choose, Explorer):
+    if isinstance(choose, LearnsWhileRecording):
         choose.begin(skills.choices)
     if isinstance(choose, RowPolicy):
         return WithDrawnGoals(choose, skills, choices) if goals_in(skills) else choose
@@ -280,7 +317,7 @@ def _play(
                 age[over] = 0
             if made >= steps:
                 rows = rows[memory["end"][rows] == CallEnd.RUNNING]
-            elif isinstance(choose, Explorer) and made - planned >= choose.every:
+            elif isinstance(choose, LearnsWhileRecording) and made - planned >= choose.every:
                 planned = made
                 feed.flush()
                 if recorder.calls:

@@ -14,9 +14,9 @@ from shared_runs import Left, Right, declare
 
 import skillweave as sw
 from skillweave.api import Run
+from skillweave.calls import CallLog, record_calls, run_log
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.errors import Interrupted, RunError
-from skillweave.planning import CallLog, record_calls, run_log
 from skillweave.runs.directory import CALLS, RunDirectory
 
 

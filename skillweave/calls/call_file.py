@@ -14,14 +14,14 @@ from torch import Tensor
 from skillweave._internal.messages import as_path
 from skillweave._internal.rewards import LARGEST_REWARD
 from skillweave.algorithms.batches import INFO
-from skillweave.errors import RunError, SkillweaveError
-from skillweave.planning.columns import (
+from skillweave.calls.columns import (
     GOAL,
     CallColumns,
     call_fields,
     columns_of,
     fields_of,
 )
+from skillweave.errors import RunError, SkillweaveError
 from skillweave.policies.core import Array, CallEnd
 from skillweave.runs.files import read_tensors, record_in, write_tensors
 from skillweave.runs.user_code import Texts
