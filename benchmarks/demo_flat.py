@@ -1,6 +1,6 @@
 """Train the flat agents that ``skillweave demo`` quotes, and record their scores for it.
 
-    python -m benchmarks.demo_flat [--seed 0] [--scale 1.0] [--out skillweave/cli/demo_flat.json]
+    python -m benchmarks.demo_flat [--seed 0] [--scale 1.0] [--out skillweave/demo/demo_flat.json]
 
 They take about five minutes, so the demo does not train them. Each has as many steps as the
 hierarchy of its task in all, those of the skills included.
@@ -15,7 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import Agent, recipes
-from skillweave.cli.demo import EPISODES, FLAT_RESULTS, MISSION, NEW_SELECTOR_STEPS, complete
+from skillweave.demo.demo_command import (
+    EPISODES,
+    FLAT_RESULTS,
+    MISSION,
+    NEW_SELECTOR_STEPS,
+    complete,
+)
 from skillweave.recipes import lander_missions as missions
 
 

@@ -47,7 +47,7 @@ TESTS = (
     "tests/hierarchy/test_options.py",
     "tests/reporting/test_curves_figure.py",
     "tests/reporting/test_progress.py",
-    "tests/reporting/test_report_data.py",
+    "tests/html_report/test_report_data.py",
     "tests/reporting/test_video.py",
     "tests/runs/test_directory.py",
     "tests/runs/test_trackers.py",

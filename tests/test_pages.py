@@ -11,7 +11,7 @@ from hub_server import go_to, serve
 from pages import BLOCK, INCLUDED, ROOT, run_page, train_briefly
 
 from skillweave._internal.public import HOMES
-from skillweave.cli.commands import COMMANDS, name_of
+from skillweave.cli.commands import all_commands
 
 README = ROOT / "README.md"
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -58,7 +58,7 @@ def test_pages_show_whole_files_that_exist():
 
 
 def test_commands_and_modules_that_pages_tell_to_run_exist():
-    known = {name_of(c) for c in COMMANDS}
+    known = set(all_commands())
     for page in (README, *PAGES):
         text = page.read_text()
         assert set(re.findall(r"^\s*skillweave ([\w-]+)", text, flags=re.M)) <= known, page

@@ -17,13 +17,17 @@ from pages import BLOCK, train_briefly
 
 from skillweave import SkillweaveError
 from skillweave._internal.public import HOMES
-from skillweave.cli.commands import COMMANDS
+from skillweave.cli.commands import all_commands
 from skillweave.errors import KINDS
 from skillweave.types import Array, Policy
 
 ALIASES = ("Array",)
 """Names of what is another library's: the reference explains them."""
-THINGS = {n: getattr(import_module(m), n) for m, homes in HOMES.items() for n in homes}
+BRIEF = ("skillweave.calls", "skillweave.planning")
+"""Modules whose classes also have methods that only the library calls, described briefly."""
+THINGS = {
+    n: getattr(import_module(m), n) for m, homes in HOMES.items() if m not in BRIEF for n in homes
+}
 """Every public name's object."""
 ARRAY = re.compile(r"\b(Array|Tensor|Views|Float|Int|Bool)\b")
 
@@ -130,7 +134,11 @@ def test_a_public_name_says_all_that_a_user_needs(name):
 DATACLASSES = [kind for n in NAMES if dataclasses.is_dataclass(kind := THINGS[n])]
 
 
-@pytest.mark.parametrize("kind", [*DATACLASSES, *COMMANDS], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize(
+    "kind",
+    [*DATACLASSES, *(kind for kind, _ in all_commands().values())],
+    ids=lambda kind: kind.__name__,
+)
 def test_every_field_of_a_public_dataclass_is_explained(kind):
     """By the text under it, by the comment beside it, or by the class; ``--help`` shows it, too."""
     said = set[str]()

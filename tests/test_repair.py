@@ -15,14 +15,14 @@ from small_runs import assert_same, stage_entry
 
 import skillweave as sw
 from skillweave.algorithms import ppo
-from skillweave.api import Run, repairing
+from skillweave.api import Run
 from skillweave.calls import Handover, held, record_calls
 from skillweave.calls.record import RandomChoice
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.experience.collector import Collector
-from skillweave.hierarchy import repair
 from skillweave.hierarchy.roles import roles_of
 from skillweave.planning import Mission
+from skillweave.repair import repair_stage as repair, repairing
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Matrix, RepairEntry
 
@@ -280,8 +280,9 @@ def test_the_event_of_a_repair_is_the_callers_or_success():
 def test_calls_of_a_repair_have_the_selectors_limit():
     roles = roles_of(declare(Press(), Flip(), call_steps=5))
     policies = {name: RandomChoice(3) for name in roles.skills}
-    entry = RepairEntry("press", "flip", 20, [], "", Matrix([], [], [], [], []))
-    stage = repair.repair_stage(roles, stage_entry("r"), entry)
+    entry = stage_entry("r")
+    entry.repair = RepairEntry("press", "flip", 20, [], "", Matrix([], [], [], [], []))
+    stage = repair.repair_stage(roles, entry, None)
     collector = stage.learning_task(policies).collector(2, None)
     assert isinstance(collector, Collector)
     assert collector.limit == 5, "of 8 by itself"

@@ -7,11 +7,12 @@ from typing import get_type_hints
 import pytest
 
 import skillweave as sw
-from skillweave.api.train_options import RepairOptions, TrainOptions
+from skillweave.api.train_options import TrainOptions
 from skillweave.cli.commands import ResumeCommand, TrainCommand
 from skillweave.cli.elsewhere import OF_TRAIN
 from skillweave.hierarchy.settings import USUAL_CALL_STEPS, Settings
 from skillweave.planning import Planner
+from skillweave.repair.repairing import RepairOptions
 from skillweave.training.defaults import AGENT_DEFAULTS, HIERARCHY_DEFAULTS, TrainDefaults
 
 OF_HIERARCHIES = {"log_calls", "log_calls_info", "flat"}

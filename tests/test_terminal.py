@@ -301,7 +301,7 @@ def test_a_run_in_a_locale_of_ascii(tmp_path):
         assert b"Traceback" not in done.stderr
 
 
-PICTURES = ("reporting/report/", "reporting/lineage.py", "reporting/curves_figure.py")
+PICTURES = ("html_report/", "reporting/lineage.py", "reporting/curves_figure.py")
 PICTURES += ("reporting/displays.py",)
 """Modules whose texts are drawn, or written to pages and terminals that know all letters."""
 

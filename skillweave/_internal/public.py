@@ -43,6 +43,12 @@ PUBLIC = {
         "ops.optim": "adam_ clip_grad_norm_",
         "ops.returns": "gae",
     },
+    "skillweave.calls": {
+        "calls.handover": "Blame CallEnds Chain Handover",
+        "calls.log": "CallLog join",
+        "calls.predicates": "Predicate held successes",
+        "calls.record": "record_calls",
+    },
     "skillweave.envs": {
         "api.make_options": "make_options_env",
         "envs.pool": "PoolWrapper envpool one_of",
@@ -55,6 +61,15 @@ PUBLIC = {
     "skillweave.evolution": {
         "evolution.config": "Evolution Mutations Range Tournament Truncation",
         "evolution.selection": "Heir ParentSelection",
+    },
+    "skillweave.planning": {
+        "planning.explorer": "Explorer",
+        "planning.forecast": "Forecast",
+        "planning.goal": "GoalTask reached",
+        "planning.machine": "RewardMachine",
+        "planning.mission": "Mission as_task either in_any_order",
+        "planning.planned_run": "PlannedRun",
+        "planning.planner": "Planner",
     },
     "skillweave.reporting": {"reporting.curves_figure": "plot_curves"},
     "skillweave.types": {
@@ -77,12 +92,16 @@ HOMES = {
 """Modules that define the public names, by public module and name."""
 
 
+ALSO = {"skillweave.planning": "skillweave.calls"}
+"""Modules in which the names of another one are found, too: tasks are made of predicates."""
+
+
 def lazy(module: str) -> tuple[list[str], Callable[[str], Any], Callable[[], Iterable[str]]]:
     """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a module that users import from.
 
     Names are imported when first used: torch takes two seconds, which ``--help`` must not pay.
     """
-    homes = HOMES[module]
+    homes = HOMES.get(ALSO.get(module, ""), {}) | HOMES[module]
 
     def get(name: str) -> Any:
         """Import a public name of the module when it is first used."""

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from statistics import fmean
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium as gym
 
 from skillweave._internal.arguments import checked_names
+from skillweave._internal.extensions import fetch
 from skillweave._internal.messages import as_path, short, shown_path
-from skillweave._internal.notices import notice
 from skillweave._internal.paths import AGENT, join, level_of, name_of
 from skillweave._internal.policy_protocol import Memory, Policy
 from skillweave._internal.shipped import weights_path
@@ -34,22 +32,15 @@ from skillweave.api.applying import (
     spec_of,
 )
 from skillweave.api.notebook_tables import declared_html, declared_line, run_html
-from skillweave.api.planning import (
-    mission_words,
-    planned,
-    start_of,
-    to_train,
-    untasked,
-)
 from skillweave.api.player import Player
 from skillweave.api.push_pull import push_run
 from skillweave.api.recipe_file import hierarchy_in
-from skillweave.api.repairing import repair
 from skillweave.api.run_calls import RunCalls
 from skillweave.api.running import resume, train
 from skillweave.api.starting import StartFrom
-from skillweave.api.train_options import RepairOptions, TrainOptions
-from skillweave.calls import CallLog, Handover
+from skillweave.api.train_options import TrainOptions
+from skillweave.calls.handover import Handover
+from skillweave.calls.log import CallLog
 from skillweave.calls.record import with_returns
 from skillweave.calls.run_log import handover_json, handover_of
 from skillweave.envs.make import EngineName, EnvSpec
@@ -60,7 +51,6 @@ from skillweave.hierarchy.assembly import parts_of
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.recorded import calls_of
-from skillweave.hierarchy.repair import Repair, repairs_of
 from skillweave.hierarchy.roles import Roles, roles_of
 from skillweave.hierarchy.settings import (
     Apart,
@@ -78,18 +68,15 @@ from skillweave.hierarchy.weights import (
     write_agent,
     write_weights,
 )
-from skillweave.planning import Planner
-from skillweave.planning.forecast import Forecast, forecast, played
 from skillweave.reporting.palette import RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
-from skillweave.reporting.report.single import write_report
 from skillweave.reporting.video import Film, render_policy
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.runs.manifest import LevelEntry, manifest_in
 from skillweave.runs.trackers import track_film
-from skillweave.schema import AtLeastOne, Count, as_json, fitted
+from skillweave.schema import AtLeastOne, as_json
 from skillweave.skills import Reflex, Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
@@ -106,6 +93,10 @@ from skillweave.training.evaluation_file import (
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.training.stage import Together
 from skillweave.workers.cluster import Ray
+
+if TYPE_CHECKING:  # what extensions return
+    from skillweave.planning.planned_run import PlannedRun
+    from skillweave.repair.repair_stage import Repair
 
 
 class Trainable:
@@ -888,36 +879,18 @@ class TrainedPolicy:
             RunError: there is no log, it is of other skills, or no step of it does what the task
                 needs.
         """
-        declared = self.hierarchy
-        if log is None:
-            log = self.calls
-        elif isinstance(log, CallLog):
-            log.check_environment(self._own_spec())
-        if isinstance(task, str):
-            words = {} if predicates is None else predicates
-            if isinstance(words, Mapping):  # else the planner says what it is
-                predicates = mission_words(declared, words)
-        planner = Planner(
-            log,
+        made: PlannedRun = fetch("plan")(
+            self,
             task,
+            log,
             predicates=predicates,
-            skills=self.policy,
-            features=declared.features if features is None else features,
+            features=features,
             neighbors=neighbors,
             gamma=gamma,
             caution=caution,
             temperature=temperature,
         )
-        hierarchy, policy = planned(declared, self.policy, planner)
-        run = PlannedRun(hierarchy, self.path, policy)
-        # Each goal of its own would need a plan of its own now.
-        if planner.already:
-            notice(planner.already)
-        if planner.plan.size and (expected := run.explain()).reason:
-            share = expected.chance
-            chance = "no known chance" if share is None else f"a chance of {share:.0%}"
-            notice(f"this plan has {chance}: {expected.reason}")
-        return run
+        return made
 
     def _own_spec(self) -> EnvSpec:
         """Return the environment of the hierarchy's own task."""
@@ -995,7 +968,7 @@ class Run(TrainedPolicy):
             RunError: this is no run but a weights file, or the file cannot be written.
         """
         run = RunDirectory.open(self.path)
-        return write_report(
+        written: dict[str, Any] = fetch("report")(
             run,
             run.path / "report.html" if path is None else as_path(path, "path"),
             self.policy,
@@ -1006,6 +979,7 @@ class Run(TrainedPolicy):
             deterministic=deterministic,
             quiet=quiet,
         )
+        return written
 
     @checked_names
     def save_weights(self, path: str | Path) -> Path:
@@ -1108,11 +1082,10 @@ class Run(TrainedPolicy):
             RunError: the run was planned, or loaded without its code; or ``run_dir`` holds
                 something else.
         """
-        declared = self.hierarchy
-        assert isinstance(self.policy, HierarchyPolicy)
-        options = RepairOptions(
-            skill,
-            after,
+        repaired: Run = fetch("repair")(
+            self,
+            skill=skill,
+            after=after,
             steps=steps,
             run_dir=run_dir,
             done=done,
@@ -1122,105 +1095,15 @@ class Run(TrainedPolicy):
             quiet=quiet,
             callback=callback,
         )
-        return run_of(repair(declared, self.path, self.policy, options))
+        return repaired
 
     @property
     def repairs(self) -> list[Repair]:
         """The repairs of its skills, the latest last: both matrices, the reason, the result."""
-        return repairs_of(RunDirectory.open(self.path)) if self.path.is_dir() else []
-
-
-class PlannedRun(TrainedPolicy):
-    """Skills of a run with a planner for a new task; nothing of it is written."""
-
-    _kind = "PlannedRun of"
-    _mark = "-plan"
-    _forecast: Forecast | None = None
-
-    def __getattr__(self, name: str) -> Any:
-        if hasattr(Run, name):
-            self._check_written()
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-
-    @checked_names
-    def with_selector(
-        self,
-        algorithm: AlgorithmConfig | None = None,
-        *,
-        steps: int = 100_000,
-        target_kl: float | None = 0.05,
-    ) -> Hierarchy:
-        """Return the skills on the task, with a selector to train that starts from the plan.
-
-        ```python
-        def trained(planned):
-            return planned.with_selector(steps=50_000).train("runs/mission")
-        ```
-
-        Before its training the selector learns to choose as the plan does, in logged observations;
-        then it learns by itself, and the plan guides it. Skills are not trained. The selector also
-        sees the state of the task; skills see what they saw. ``load`` of the same declaration loads
-        the run later.
-
-        Args:
-            algorithm: settings of the selector, ``PPO``; None: ``PPO()``.
-            steps: training steps of the selector.
-            target_kl: while it learns, keep the selector within this KL of the plan; None: the plan
-                is its start alone.
-
-        Raises:
-            DeclarationError: an argument is wrong, or the selector cannot start from a plan.
-        """
-        spec = self._own_spec()
-        planner = self.hierarchy.selector
-        assert isinstance(self.policy, HierarchyPolicy)
-        assert isinstance(planner, Planner)
-        config: Any = PPO() if algorithm is None else algorithm
-        declared = Hierarchy(
-            **to_train(spec, self.policy, planner, self.hierarchy.rest, config, target_kl),
-            steps=fitted(AtLeastOne, steps, "with_selector(): steps"),
-        )
-        declared._starts = partial(start_of, planner, self.policy, declared.spec, config)
-        return declared
-
-    @checked_names
-    def explain(self, *, episodes: int = 0) -> Forecast:
-        """Return the calls that the plan intends, its chance and its steps.
-
-        Printed, it is a line. Before the plan is played, episodes are simulated along the logged
-        calls.
-
-        Args:
-            episodes: are played, where that may be done, and chance and steps are theirs; 0: none.
-
-        Raises:
-            RunError: the log has no start of an episode.
-        """
-        planner = self.hierarchy.selector
-        assert isinstance(planner, Planner)
-        if self._forecast is None:
-            self._forecast = forecast(planner)
-        if not fitted(Count, episodes, "explain(): episodes"):
-            return self._forecast
-        found = self.evaluate(episodes, quiet=True)
-        return played(self._forecast, found.succeeded, episodes, fmean(found.lengths))
-
-    def _own_spec(self) -> EnvSpec:
-        return untasked(self.hierarchy.spec)
-
-    def _check_logged(self) -> None:
-        """Raise a DeclarationError: evaluations of a planned run cannot log calls."""
-        raise DeclarationError(
-            "episodes of a planned run end with its task, so the calls in them are cut there: "
-            "leave out log_calls, and record whole calls with "
-            "run.log_calls(choose=run.policy.selector)"
-        )
-
-    def _check_written(self) -> None:
-        raise RunError(
-            "this run was planned, so nothing of it is written or loaded again: use the run that "
-            f"its skills are from, {shown_path(self.path)}, and plan again"
-        )
+        if not self.path.is_dir():
+            return []
+        repairs: list[Repair] = fetch("repairs")(RunDirectory.open(self.path))
+        return repairs
 
 
 def info_json(

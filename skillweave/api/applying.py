@@ -21,7 +21,7 @@ from skillweave.hierarchy.recorded import (
     with_entry,
 )
 from skillweave.hierarchy.roles import Level, Roles, roles_of
-from skillweave.reporting.report.facts import plain
+from skillweave.reporting.facts import plain
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Manifest, SkillEntry, settings_of

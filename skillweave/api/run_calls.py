@@ -7,7 +7,7 @@ from pathlib import Path
 
 from skillweave._internal.messages import shown_path
 from skillweave._internal.policy_protocol import Policy
-from skillweave.calls import CallLog
+from skillweave.calls.log import CallLog
 from skillweave.calls.run_log import (
     RECORD,
     joined,

@@ -1,20 +1,20 @@
-"""The arguments of ``train``, ``resume`` and ``repair`` as data; the methods describe them.
+"""The arguments of ``train`` and ``resume`` as data; the methods describe them.
 
 ``tests/test_signatures.py`` compares them with the methods and the command line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.api.starting import StartFrom
 from skillweave.errors import DeclarationError
 from skillweave.evolution.evolving import Evolve
-from skillweave.schema import AtLeastOne, Count, fitted
+from skillweave.schema import Count, fitted
 from skillweave.training.callback import Callback, check_callback
 from skillweave.workers.cluster import Ray
 
@@ -63,33 +63,3 @@ class TrainOptions:
                 "resume continues the run in run_dir, and overwrite replaces it: leave out one of "
                 "them"
             )
-
-
-@dataclass(frozen=True)
-class RepairOptions:
-    """Arguments of ``Run.repair``, which describes them.
-
-    Raises:
-        DeclarationError: one of them is wrong.
-    """
-
-    skill: str
-    after: str
-    steps: int | None = None
-    run_dir: str | Path | None = None
-    done: Mapping[str, Any] | None = None
-    calls: int = 200
-    seed: int = 0
-    resume: bool = False
-    quiet: bool = False
-    callback: Callback | None = None
-
-    def __post_init__(self) -> None:
-        check_callback(self.callback)
-        for name, kind in (("steps", AtLeastOne | None), ("calls", AtLeastOne), ("seed", Count)):
-            object.__setattr__(self, name, fitted(kind, getattr(self, name), name))
-
-    @property
-    def training(self) -> TrainOptions:
-        """The options of the training in it."""
-        return TrainOptions(self.run_dir, seed=self.seed, quiet=self.quiet, callback=self.callback)

@@ -3,20 +3,28 @@
 Begin with ``log``; ``recorder`` makes logs, and ``handover`` counts what they say.
 """
 
-from skillweave.calls.handover import Blame, CallEnds, Chain, Handover
-from skillweave.calls.log import CallLog, join
-from skillweave.calls.predicates import Predicate, held, successes
-from skillweave.calls.record import record_calls
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Blame",
-    "CallEnds",
-    "CallLog",
-    "Chain",
-    "Handover",
-    "Predicate",
-    "held",
-    "join",
-    "record_calls",
-    "successes",
-]
+from skillweave._internal.public import lazy
+
+if TYPE_CHECKING:
+    from skillweave.calls.handover import (
+        Blame as Blame,
+        CallEnds as CallEnds,
+        Chain as Chain,
+        Handover as Handover,
+    )
+    from skillweave.calls.log import (
+        CallLog as CallLog,
+        join as join,
+    )
+    from skillweave.calls.predicates import (
+        Predicate as Predicate,
+        held as held,
+        successes as successes,
+    )
+    from skillweave.calls.record import (
+        record_calls as record_calls,
+    )
+else:
+    __all__, __getattr__, __dir__ = lazy(__name__)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from math import prod
 from pathlib import Path
@@ -11,9 +11,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave._internal.policy_protocol import Policy
 from skillweave.calls.call_file import read_calls, write_calls
 from skillweave.calls.columns import columns_of, fields_of
 from skillweave.calls.handover import LinkedCalls
+from skillweave.calls.neighbors import FEATURES
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, RunError
 from skillweave.policies.untrusted import checksum
@@ -27,7 +29,7 @@ from skillweave.runs.user_code import (
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import without_goal
 from skillweave.skills.own_part import OwnPart
-from skillweave.skills.skill_set import SkillSet
+from skillweave.skills.skill_set import SkillSet, skills_below
 from skillweave.spaces import obs_codec, same_space
 
 LEARNING = "learning"
@@ -259,6 +261,27 @@ def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:
             places = tuple(place for place in places if place < size)
         found.append(places or None)
     return tuple(found)
+
+
+def lacking_features(
+    features: Any, space: gym.Space[Any], policy: Policy, skill: str | None = None
+) -> str:
+    """Return a sentence if skills see images, by which calls cannot be compared; it may be empty.
+
+    Args:
+        features: the hierarchy's.
+        space: of the observations.
+        policy: with the skills, of the whole hierarchy or of one level.
+        skill: the name of the one that counts; None: all do.
+    """
+    skills = skills_below(policy)
+    if skills is None or not obs_codec(space).images:
+        return ""
+    for one, places in zip(skills.skills, seen_places(skills), strict=True):
+        own = features.get(one.name) if isinstance(features, Mapping) else features
+        if places is None and own is None and skill in (None, one.name):
+            return f"calls of {one.name!r} cannot be compared by images; {FEATURES}"
+    return ""
 
 
 def _places_of_part(part: OwnPart) -> tuple[int, ...] | None:

@@ -1,4 +1,4 @@
-"""Commands of the command line as dataclasses: the parser is generated from these.
+"""Commands of the core as dataclasses: the parser is generated from these, and extensions' own.
 
 Nothing here imports torch or gymnasium, so that help and argument errors are instant.
 """
@@ -6,12 +6,17 @@ Nothing here imports torch or gymnasium, so that help and argument errors are in
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
+
+from skillweave._internal.extensions import COMMANDS, fetch_from
+from skillweave.errors import MissingExtra
 
 Out = Annotated[Path, arg(aliases=["-o"])]
 """A place to write to."""
@@ -126,18 +131,6 @@ class TrainCommand(OnRay):
 
 
 @dataclass(frozen=True)
-class DemoCommand(Output):
-    """Train, score and film two tasks in three minutes: where skills pay, and where not."""
-
-    out: Out = Path("runs/demo")
-    """A new directory for runs, films and the report."""
-    seed: int = 0
-    """The root of every random stream."""
-    scale: float = 1.0
-    """Multiply every training budget and number of episodes: 0.02 for a quick look."""
-
-
-@dataclass(frozen=True)
 class ResumeCommand(OnRay, Coded, OfRun):
     """Finish a run that was stopped; the end is the same as if it had not been."""
 
@@ -216,25 +209,6 @@ class LogCommand(Coded, OfRun):
 
 
 @dataclass(frozen=True)
-class PlanCommand(Loaded):
-    """Plan a new mission on a run's recorded calls, and score it; nothing is trained."""
-
-    target: Positional[str] = tyro.MISSING
-    """A run's directory, or with --pretrained a recipe's name."""
-    mission: Positional[str] = tyro.MISSING
-    """Such as "left then hover for 100 steps, avoid crash". A skill's name means its success; a
-    recipe may declare more words: Hierarchy(predicates=...)."""
-    steps: int = 20_000
-    """Environment steps to record first, if there is no log of calls."""
-    episodes: int = 20
-    """Whole episodes to score it in."""
-    film: MaybeOut = None
-    """A .gif or .mp4 file to write."""
-    seed: int = 0
-    """Picks the episodes."""
-
-
-@dataclass(frozen=True)
 class PlotCommand(Output):
     """Draw learning curves as PNG and SVG: of one run, or of many seeds with bands, for a paper.
 
@@ -256,28 +230,6 @@ class PlotCommand(Output):
     """Name of a line in the figure of several runs, once for each line, in their order."""
     width: float = 3.3
     """Width of the figure of several runs in inches; a column of a paper has 3.3."""
-
-
-@dataclass(frozen=True)
-class ReportCommand(OfEpisodes, Coded, OfRun):
-    """Write one HTML file about a run: film, timeline of calls, curves, skills, settings."""
-
-    out: MaybeOut = None
-    """The file to write; default: report.html in the run."""
-    episodes: int = 20
-    """Episodes to play, with seeds that training never used."""
-    films: int = 3
-    """Number of these episodes to film, from the worst to the best; 0: no film."""
-
-
-@dataclass(frozen=True)
-class CompareCommand(Output):
-    """Write one HTML file that compares runs; those that differ by their seed alone are a group."""
-
-    runs: Runs = tyro.MISSING
-    """Directories of runs, or of sweeps."""
-    out: Out = Path("compare.html")
-    """The file to write."""
 
 
 @dataclass(frozen=True)
@@ -335,40 +287,46 @@ class PullCommand(Output):
     """A branch, a tag or a commit; default: the latest."""
 
 
-@dataclass(frozen=True)
-class ImportAgilerlCommand(Output):
-    """Convert a checkpoint of AgileRL 0.1 or 1.0, which is a pickle."""
-
-    file: Positional[Path] = tyro.MISSING
-    """The checkpoint."""
-    trust: bool = False
-    """You trust where it comes from; needed, although it is read without running code from it."""
-    out: MaybeOut = None
-    """The file to write; default: FILE with the suffix .safetensors."""
-
-
-COMMANDS = (
-    DemoCommand,
-    TrainCommand,
-    ResumeCommand,
-    SweepCommand,
-    EvaluateCommand,
-    RenderCommand,
-    LogCommand,
-    PlanCommand,
-    PlotCommand,
-    ReportCommand,
-    CompareCommand,
-    ListCommand,
-    InfoCommand,
-    WeightsCommand,
-    ExportCommand,
-    PushCommand,
-    PullCommand,
-    ImportAgilerlCommand,
+CommandEntry = tuple[type[Output], str]
+"""A command, and "module:function", which is given it and returns its ``Result``."""
+OWN: tuple[CommandEntry, ...] = (
+    (TrainCommand, "skillweave.cli.training_commands:train"),
+    (ResumeCommand, "skillweave.cli.training_commands:resume"),
+    (SweepCommand, "skillweave.cli.sweep:sweep"),
+    (EvaluateCommand, "skillweave.cli.execute:evaluate"),
+    (RenderCommand, "skillweave.cli.execute:render"),
+    (LogCommand, "skillweave.cli.execute:log"),
+    (PlotCommand, "skillweave.cli.execute:plot"),
+    (ListCommand, "skillweave.cli.execute:list_all"),
+    (InfoCommand, "skillweave.cli.execute:info"),
+    (WeightsCommand, "skillweave.cli.execute:weights"),
+    (ExportCommand, "skillweave.cli.execute:export"),
+    (PushCommand, "skillweave.cli.execute:push"),
+    (PullCommand, "skillweave.cli.execute:pull"),
 )
+"""The commands of the core."""
 
 
 def name_of(command: type) -> str:
     """Return the name of a command: import-agilerl for ImportAgilerlCommand."""
     return re.sub(r"(?<!^)(?=[A-Z])", "-", command.__name__.removesuffix("Command")).lower()
+
+
+def all_commands() -> dict[str, CommandEntry]:
+    """Return the commands of the core and of the extensions that are installed, by name."""
+    entries = {name_of(entry[0]): entry for entry in OWN}
+    for name in COMMANDS:
+        with suppress(MissingExtra):
+            entries[name] = fetch_from(COMMANDS, name)
+    return entries
+
+
+def missing(words: Sequence[str]) -> str:
+    """Return a sentence where words name a command of an extension that is not installed."""
+    if not words or words[0] not in COMMANDS:
+        return ""
+    try:
+        fetch_from(COMMANDS, words[0])
+    except MissingExtra as error:
+        return str(error)
+    return ""

@@ -86,7 +86,9 @@ def _main(words: Sequence[str], put: Put, alone: bool) -> int:
             from skillweave.cli.elsewhere import foreign_words
             from skillweave.errors import SkillweaveError
 
-            parser: dict[str, Any] = {commands.name_of(c): c for c in commands.COMMANDS}
+            parser: dict[str, Any] = {k: kind for k, (kind, _) in commands.all_commands().items()}
+            if missing := commands.missing(words):
+                return _fail(words, put, missing, 1)
             if wrong := foreign_words(words, parser):
                 return _fail(words, put, wrong, 2)
             command = tyro.extras.subcommand_cli_from_dict(

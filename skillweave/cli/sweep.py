@@ -23,12 +23,12 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from skillweave import recipes
 from skillweave._internal.messages import error_text, short
+from skillweave._internal.shipped import file_of
 from skillweave._internal.terminal import say
 from skillweave.api import Hierarchy
 from skillweave.api.loading import finished_run
-from skillweave.api.recipe_file import imported
+from skillweave.api.recipe_file import hierarchy_in, imported
 from skillweave.api.running import existing_run
 from skillweave.cli import commands
 from skillweave.cli.jobs import ProcessEnded, Processes
@@ -38,7 +38,7 @@ from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy import training
 from skillweave.policies.untrusted import shown
-from skillweave.reporting.report.groups import over_seeds
+from skillweave.reporting.groups import over_seeds
 from skillweave.runs.files import read_json, write_json
 from skillweave.runs.manifest import Manifest
 from skillweave.schema import AtLeastOne, fit, fitted
@@ -190,7 +190,7 @@ def _hierarchies(
 ) -> Iterator[tuple[str, Hierarchy]]:
     """Yield each choice of a sweep's settings by name, and the hierarchy with these."""
     for choice in choices:
-        hierarchy = recipes.load(command.recipe)
+        hierarchy = hierarchy_in(command.recipe, Hierarchy)
         apply_overrides(hierarchy, [*command.set, *choice])
         hierarchy.scale(command.scale)
         # Runs share the cores, so each has one process, or as many as the recipe sets: the same
@@ -344,7 +344,7 @@ def must_be_same_code(out: Path, recipe: str) -> None:
             written.
     """
     file = out / MARK
-    code = _checksum(code_files(recipes.file_of(recipe)))
+    code = _checksum(code_files(file_of(recipe)))
     learnt = any(out.glob("*/checkpoint*")) or any(out.glob("*/policies/*"))
     if not learnt or not file.exists():
         write_json(file, Mark(recipe=recipe, code=code))

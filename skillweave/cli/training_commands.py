@@ -9,11 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from skillweave import recipes
 from skillweave._internal.messages import shown_path
 from skillweave._internal.terminal import put_result
 from skillweave.api import Hierarchy, Run
 from skillweave.api.loading import declared_by
+from skillweave.api.recipe_file import hierarchy_in
 from skillweave.cli import commands
 from skillweave.cli.output import Result, run_words, save_score
 from skillweave.cli.overrides import apply_overrides, parse_evolve
@@ -41,7 +41,7 @@ def train(command: commands.TrainCommand) -> Result:
         raise RunError(f"{flat_out} is there already: the flat agent would be written there")
     if (command.resume or command.overwrite) and command.out is None:
         raise DeclarationError("--resume and --overwrite need a run: name its directory, --out DIR")
-    hierarchy = recipes.load(command.recipe)
+    hierarchy = hierarchy_in(command.recipe, Hierarchy)
     apply_overrides(hierarchy, command.set)
     hierarchy.scale(command.scale)
     if command.collectors is not None:

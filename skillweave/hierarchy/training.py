@@ -9,12 +9,12 @@ from skillweave._internal.paths import SELECTOR, level_of
 from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.errors import DeclarationError, RunError
+from skillweave.hierarchy.added_stages import added_stage
 from skillweave.hierarchy.assembly import assembled, can_act
 from skillweave.hierarchy.checks import check_nested
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.fitting import ready_policies, ready_selectors
 from skillweave.hierarchy.recorded import level_entry, skill_entries
-from skillweave.hierarchy.repair import judge_repair, repair_stage
 from skillweave.hierarchy.roles import Roles, roles_of
 from skillweave.hierarchy.schedule import budgets_of, level_stages, stages_of
 from skillweave.hierarchy.select_best import resolve_greedy, select_best
@@ -143,8 +143,9 @@ def _repaired(roles: Roles, course: Course, policies: Policies) -> Policies:
                 f"{', '.join(repair.done)}, which is code: "
                 f"continue it by {repair_words(repair, run)}"
             )
-        after = course.train([repair_stage(roles, entry, repair, done)], policies)
-        if judge_repair(roles, course, entry, repair, assembled(roles, after)):
+        kind = added_stage("repair")
+        after = course.train([kind.make(roles, entry, done)], policies)
+        if kind.judge(roles, course, entry, assembled(roles, after)):
             policies = after
     return policies
 

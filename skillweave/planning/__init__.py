@@ -4,44 +4,53 @@ Begin with ``machine``, which says what a task is; ``planner`` solves it. The na
 ``skillweave.calls`` are here, too.
 """
 
-from skillweave.calls import (
-    Blame,
-    CallEnds,
-    CallLog,
-    Chain,
-    Handover,
-    Predicate,
-    held,
-    join,
-    record_calls,
-    successes,
-)
-from skillweave.planning.explorer import Explorer
-from skillweave.planning.forecast import Forecast
-from skillweave.planning.goal import GoalTask, reached
-from skillweave.planning.machine import RewardMachine
-from skillweave.planning.mission import Mission, as_task, either, in_any_order
-from skillweave.planning.planner import Planner
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Blame",
-    "CallEnds",
-    "CallLog",
-    "Chain",
-    "Explorer",
-    "Forecast",
-    "GoalTask",
-    "Handover",
-    "Mission",
-    "Planner",
-    "Predicate",
-    "RewardMachine",
-    "as_task",
-    "either",
-    "held",
-    "in_any_order",
-    "join",
-    "reached",
-    "record_calls",
-    "successes",
-]
+from skillweave._internal.public import lazy
+
+if TYPE_CHECKING:
+    from skillweave.calls.handover import (
+        Blame as Blame,
+        CallEnds as CallEnds,
+        Chain as Chain,
+        Handover as Handover,
+    )
+    from skillweave.calls.log import (
+        CallLog as CallLog,
+        join as join,
+    )
+    from skillweave.calls.predicates import (
+        Predicate as Predicate,
+        held as held,
+        successes as successes,
+    )
+    from skillweave.calls.record import (
+        record_calls as record_calls,
+    )
+    from skillweave.planning.explorer import (
+        Explorer as Explorer,
+    )
+    from skillweave.planning.forecast import (
+        Forecast as Forecast,
+    )
+    from skillweave.planning.goal import (
+        GoalTask as GoalTask,
+        reached as reached,
+    )
+    from skillweave.planning.machine import (
+        RewardMachine as RewardMachine,
+    )
+    from skillweave.planning.mission import (
+        Mission as Mission,
+        as_task as as_task,
+        either as either,
+        in_any_order as in_any_order,
+    )
+    from skillweave.planning.planned_run import (
+        PlannedRun as PlannedRun,
+    )
+    from skillweave.planning.planner import (
+        Planner as Planner,
+    )
+else:
+    __all__, __getattr__, __dir__ = lazy(__name__)

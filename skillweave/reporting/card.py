@@ -11,8 +11,8 @@ from typing import Any
 from urllib.parse import quote
 
 from skillweave.calls.run_log import handover_of
-from skillweave.reporting.report.curves import reached_steps, read_curves
-from skillweave.reporting.report.facts import WHY, WORDS, facts, plain, stage_rows
+from skillweave.reporting.curves import reached_steps, read_curves
+from skillweave.reporting.facts import WHY, WORDS, facts, plain, stage_rows
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import public
 from skillweave.runs.manifest import settings_of

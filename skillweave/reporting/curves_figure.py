@@ -14,9 +14,9 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import as_path, short, suggest
 from skillweave.errors import DeclarationError, RunError, needs_extra
 from skillweave.policies.core import Array
-from skillweave.reporting.report.curves import read_curves
-from skillweave.reporting.report.facts import is_binary
-from skillweave.reporting.report.groups import grouped, on_one_grid
+from skillweave.reporting.curves import read_curves
+from skillweave.reporting.facts import is_binary
+from skillweave.reporting.groups import grouped, on_one_grid
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import written
 from skillweave.runs.hub import must_be_own

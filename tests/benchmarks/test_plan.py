@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from line_world import TINY, Line
 from call_logs.logs import log_of
+from line_world import TINY, Line
 
 from benchmarks.pay.results import Result
 from benchmarks.plan import __main__ as command

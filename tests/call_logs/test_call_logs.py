@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from goals.worlds import Point
 from call_logs.untrained import SKILLS, skill_set
+from goals.worlds import Point
 from ready_selectors.chain import DOOR, KEY, LAST, NAMES, SPEC, hierarchy
 from toys import skills_of
 

@@ -12,7 +12,8 @@ import pytest
 
 from skillweave import recipes
 from skillweave.cli import commands, main
-from skillweave.cli.demo import FLAT_RESULTS, MISSION, NEW_SELECTOR_STEPS, complete, shares
+from skillweave.demo.commands import DemoCommand
+from skillweave.demo.demo_command import FLAT_RESULTS, MISSION, NEW_SELECTOR_STEPS, complete, shares
 from skillweave.recipes import lander_missions as missions
 
 
@@ -65,4 +66,4 @@ def test_words_for_numbers() -> None:
     assert shares({"left": 0.4, "land": 0.6}) == "left 40%, land 60%"
     score: Any = SimpleNamespace(returns=(1.0, 0.6667, 0.9999, 0.0))
     assert complete(score) == 0.5
-    assert commands.name_of(commands.DemoCommand) == "demo"
+    assert commands.name_of(DemoCommand) == "demo"

@@ -127,7 +127,7 @@ def test_an_error_that_nobody_expected_is_one_object_and_a_traceback(here: Path)
         "import sys\n"
         "from skillweave.cli import execute, main\n"
         "def fail(command): raise LookupError('a fault of the library')\n"
-        "execute.WAYS.update({kind: fail for kind in execute.WAYS})\n"
+        "execute.way_of = lambda name: fail\n"
         "sys.exit(main())\n"
     )
     done = call("list", "--json", program="broken.py")
@@ -165,12 +165,12 @@ def test_a_closed_stream_changes_no_exit_code(here: Path, stream: str) -> None:
 def test_numbers_that_json_lacks_are_null(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from skillweave.cli import commands, execute
+    from skillweave.cli import execute
 
     def numbers(command: Any) -> Any:
         return {"a": [float("nan"), 1.5], "b": float("inf")}, ""
 
-    monkeypatch.setitem(execute.WAYS, commands.ListCommand, numbers)
+    monkeypatch.setattr(execute, "way_of", lambda name: numbers)
     assert main(["list", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"a": [None, 1.5], "b": None}
 

@@ -9,7 +9,7 @@ from goals.worlds import Rest, declared, go_to, ready, walk
 import skillweave as sw
 from skillweave.calls import CallLog, join
 from skillweave.errors import RunError
-from skillweave.hierarchy.repair import rehearsed_obs
+from skillweave.repair.repair_stage import rehearsed_obs
 from skillweave.skills.goals import goals_of
 
 

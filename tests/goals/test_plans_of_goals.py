@@ -7,8 +7,8 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
-from goals.worlds import Point, Rest, declared, go_to, place_of, ready
 from call_logs.logs import jumps, log_of
+from goals.worlds import Point, Rest, declared, go_to, place_of, ready
 from planning.steps import assert_not_repeated, at
 
 import skillweave as sw

@@ -118,7 +118,7 @@ def test_without_features_images_are_refused_before_anything_is_measured(tmp_pat
     for call in (lambda: log.chain("go", "wave"), lambda: log.blame("wave", "go")):
         with pytest.raises(DeclarationError, match="skill 'wave' sees images"):
             call()
-    from skillweave.api import repairing
+    from skillweave.repair import repairing
 
     monkeypatch.setattr(repairing, "measure", None)
     with pytest.raises(DeclarationError, match=r"calls of 'wave' cannot be compared by images"):

@@ -8,10 +8,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from goals.worlds import Point
 from call_logs.logs import log_of
-from planning.steps import assert_not_repeated, at, step_to, watched
 from call_logs.untrained import SKILLS, skill_set
+from goals.worlds import Point
+from planning.steps import assert_not_repeated, at, step_to, watched
 from ready_selectors.chain import (
     DOOR,
     KEY,

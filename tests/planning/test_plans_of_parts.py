@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:this plan has a chance")  # noth
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setattr("skillweave.training.imitation.GRADIENT_STEPS", 50)
-    monkeypatch.setattr("skillweave.api.planning.PAIRS", 200)
+    monkeypatch.setattr("skillweave.planning.planned_run.PAIRS", 200)
 
 
 def pushes(seen):

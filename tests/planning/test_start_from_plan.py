@@ -6,8 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from call_logs.logs import log_of
-from planning.steps import step_to, watched
 from call_logs.untrained import run_of
+from planning.steps import step_to, watched
 from ready_selectors.chain import (
     DOOR,
     KEY,
@@ -58,7 +58,7 @@ def planned() -> Run:
 def quick(monkeypatch):
     """Less to imitate, as the tasks are small."""
     monkeypatch.setattr("skillweave.training.imitation.GRADIENT_STEPS", 200)
-    monkeypatch.setattr("skillweave.api.planning.PAIRS", 1_000)
+    monkeypatch.setattr("skillweave.planning.planned_run.PAIRS", 1_000)
 
 
 def test_a_selector_starts_as_the_plan(planned):
@@ -83,7 +83,7 @@ def test_only_a_new_run_learns_to_choose_as_the_plan(planned, monkeypatch):
     def again(*given):
         raise AssertionError("it learnt the plan's choices again")
 
-    monkeypatch.setattr("skillweave.api.planning.imitate", again)
+    monkeypatch.setattr("skillweave.planning.planned_run.imitate", again)
     assert declared.train(run.path, quiet=True, resume=True).policy is not None
     with pytest.raises(AssertionError, match="again"):
         declared.train(quiet=True)

@@ -19,7 +19,7 @@ from skillweave import Agent, Apart, EnvSpec, Hierarchy, SkillweaveError
 from skillweave.cli.execute import run_lines
 from skillweave.errors import DeclarationError, Interrupted
 from skillweave.evolution import Evolution
-from skillweave.reporting.report.facts import stage_rows
+from skillweave.reporting.facts import stage_rows
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import TrainEvent
 

@@ -39,7 +39,7 @@ from skillweave.envs.env_infos import info_numbers
 from skillweave.errors import EnvError
 from skillweave.evolution import Evolution
 from skillweave.hierarchy import training
-from skillweave.reporting.report.curves import read_curves
+from skillweave.reporting.curves import read_curves
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import identity, read_manifest
 from skillweave.skills.outputs import info_keys

@@ -7,7 +7,7 @@ from timed import SMALL, Timed
 
 import skillweave as sw
 from skillweave.errors import DeclarationError
-from skillweave.reporting.report.facts import verdict
+from skillweave.reporting.facts import verdict
 
 STILL = sw.from_function(lambda obs: np.zeros(len(obs), int))
 

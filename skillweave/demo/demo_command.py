@@ -16,8 +16,8 @@ from skillweave import recipes
 from skillweave._internal.messages import shown_path
 from skillweave._internal.terminal import put_result
 from skillweave.api import Hierarchy, Run
-from skillweave.cli import commands
 from skillweave.cli.output import Result, save_score
+from skillweave.demo.commands import DemoCommand
 from skillweave.errors import MissingExtra, RunError
 from skillweave.recipes import lander_missions as missions
 from skillweave.training.evaluation import Evaluation
@@ -42,7 +42,7 @@ class Demo:
         command: as it was given.
     """
 
-    command: commands.DemoCommand
+    command: DemoCommand
     result: dict[str, Any] = field(default_factory=dict)
     """Everything as data, for ``--json``."""
     quoted: dict[str, dict[str, Any]] = field(
@@ -162,7 +162,7 @@ def complete(score: Evaluation) -> float:
     return sum(one > COMPLETE for one in score.returns) / len(score.returns)
 
 
-def demo(command: commands.DemoCommand) -> Result:
+def demo(command: DemoCommand) -> Result:
     """Run the demonstration.
 
     Raises:

@@ -15,12 +15,22 @@ from skillweave.calls.columns import ENDS
 from skillweave.calls.handover import wilson
 from skillweave.calls.run_log import load_calls
 from skillweave.envs.make import EnvSpec
-from skillweave.reporting.lineage import read_lineage, setting_title, short_value
-from skillweave.reporting.palette import RGB, color_of, hex_of, is_light
-from skillweave.reporting.progress import EpisodeProgress
-from skillweave.reporting.report import charts, facts
-from skillweave.reporting.report.curves import metrics_of, reached_steps, read_curves, thinned
-from skillweave.reporting.report.facts import (
+from skillweave.html_report import charts
+from skillweave.html_report.film import episode_shot, make_film
+from skillweave.html_report.goal_maps import goal_pictures
+from skillweave.html_report.matrix import add_handover
+from skillweave.html_report.page import Page, library
+from skillweave.html_report.timelines import (
+    chosen_episodes,
+    decision_data,
+    episode_data,
+    names_misfit,
+    rounded,
+    seen,
+)
+from skillweave.reporting import facts
+from skillweave.reporting.curves import metrics_of, reached_steps, read_curves, thinned
+from skillweave.reporting.facts import (
     WHY,
     WORDS,
     about,
@@ -35,18 +45,9 @@ from skillweave.reporting.report.facts import (
     transitions,
     verdict,
 )
-from skillweave.reporting.report.film import episode_shot, make_film
-from skillweave.reporting.report.goal_maps import goal_pictures
-from skillweave.reporting.report.matrix import add_handover
-from skillweave.reporting.report.page import Page, library
-from skillweave.reporting.report.timelines import (
-    chosen_episodes,
-    decision_data,
-    episode_data,
-    names_misfit,
-    rounded,
-    seen,
-)
+from skillweave.reporting.lineage import read_lineage, setting_title, short_value
+from skillweave.reporting.palette import RGB, color_of, hex_of, is_light
+from skillweave.reporting.progress import EpisodeProgress
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.manifest import settings_of

@@ -10,20 +10,20 @@ import numpy as np
 
 from skillweave._internal.messages import short
 from skillweave._internal.seeding import Seeds, global_generators
-from skillweave.calls import CallLog, Handover
-from skillweave.calls.handover import CallEnds, before_each
+from skillweave.calls.handover import CallEnds, Handover, before_each
+from skillweave.calls.log import CallLog
 from skillweave.calls.neighbors import evenly
 from skillweave.envs.engine import RawStep
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import EnvError
+from skillweave.html_report import charts
+from skillweave.html_report.film import HOLD, Mp4, Shot, make_film
+from skillweave.html_report.page import Page
+from skillweave.html_report.timelines import coordinates, names_misfit, rounded, varying
 from skillweave.policies.core import Array
 from skillweave.policies.spaces import space_of
-from skillweave.reporting.report import charts
-from skillweave.reporting.report.facts import WHY, WORDS, number, percent, scale_of, span
-from skillweave.reporting.report.film import HOLD, Mp4, Shot, make_film
-from skillweave.reporting.report.page import Page
-from skillweave.reporting.report.timelines import coordinates, names_misfit, rounded, varying
+from skillweave.reporting.facts import WHY, WORDS, number, percent, scale_of, span
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.goals import goals_of

@@ -3,39 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from skillweave._internal.messages import as_path, short, shown_path
 from skillweave._internal.paths import join, level_of, name_of
 from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.algorithms.config import OnPolicy, alone, config_to_json
+from skillweave.api import Hierarchy, Run, run_of
 from skillweave.api.applying import Trained, apply_manifest
-from skillweave.api.planning import lacking_features
 from skillweave.api.running import start_run, train_stages
-from skillweave.api.train_options import RepairOptions
+from skillweave.api.train_options import TrainOptions
+from skillweave.calls.log import lacking_features
 from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy import training
 from skillweave.hierarchy.assembly import parts_of
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.hierarchy.repair import (
+from skillweave.hierarchy.roles import Roles, roles_of
+from skillweave.repair.repair_stage import (
     FEWEST,
     Measured,
     matrix_to_json,
     measure,
     rehearsed_obs,
 )
-from skillweave.hierarchy.roles import Roles, roles_of
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Manifest, RepairEntry, StageEntry
+from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.skills.learnable import learn_on
+from skillweave.training.callback import Callback, check_callback
 from skillweave.training.rehearsal import can_rehearse, save_rehearsal
 from skillweave.training.stage import check_stages
-
-D = TypeVar("D", bound=Declaration)
 
 USUAL_STEPS = 200_000
 """Steps of a repair for which none are given."""
@@ -43,16 +44,50 @@ GOOD = 0.95
 """A handover that is done at least this often needs no repair."""
 
 
-def repair(
-    declared: D,
-    source: Path,
-    policy: HierarchyPolicy,
-    options: RepairOptions,
-) -> Trained[D]:
-    """Repair a skill of a run in a new run; see ``Run.repair``.
+@dataclass(frozen=True)
+class RepairOptions:
+    """Arguments of ``Run.repair``, which describes them.
+
+    Raises:
+        DeclarationError: one of them is wrong.
+    """
+
+    skill: str
+    after: str
+    steps: int | None = None
+    run_dir: str | Path | None = None
+    done: Mapping[str, Any] | None = None
+    calls: int = 200
+    seed: int = 0
+    resume: bool = False
+    quiet: bool = False
+    callback: Callback | None = None
+
+    def __post_init__(self) -> None:
+        check_callback(self.callback)
+        for name, kind in (("steps", AtLeastOne | None), ("calls", AtLeastOne), ("seed", Count)):
+            object.__setattr__(self, name, fitted(kind, getattr(self, name), name))
+
+    @property
+    def training(self) -> TrainOptions:
+        """The options of the training in it."""
+        return TrainOptions(self.run_dir, seed=self.seed, quiet=self.quiet, callback=self.callback)
+
+
+def repair(run: Run, **arguments: Any) -> Run:
+    """Repair a skill of a run in a new run; the arguments are those of ``Run.repair``."""
+    declared = run.hierarchy
+    assert isinstance(run.policy, HierarchyPolicy)
+    return run_of(_repaired(declared, run.path, run.policy, RepairOptions(**arguments)))
+
+
+def _repaired(
+    declared: Hierarchy, source: Path, policy: HierarchyPolicy, options: RepairOptions
+) -> Trained[Hierarchy]:
+    """Repair a skill in a new run.
 
     Args:
-        source: the run's directory, or its weights file.
+        source: the directory of the run, or its weights file.
         policy: of the run.
     """
     roles = roles_of(declared)
@@ -118,7 +153,9 @@ def repair(
     return start_run(declared, content, options.training, reason, write, done)
 
 
-def _resume_repair(declared: D, skill: str, after: str, options: RepairOptions) -> Trained[D]:
+def _resume_repair(
+    declared: Hierarchy, skill: str, after: str, options: RepairOptions
+) -> Trained[Hierarchy]:
     """Finish a stopped run of ``Run.repair``, with the steps that it was started with."""
     if options.run_dir is None:
         raise DeclarationError(
@@ -196,7 +233,9 @@ def _measured(
     """
     level = parts_of(roles, policy)[level_of(skill)]
     assert isinstance(level, HierarchyPolicy)
-    if words := lacking_features(declared, level, name_of(skill)):
+    if words := lacking_features(
+        declared.features, declared.spec.spaces.observation, level, name_of(skill)
+    ):
         raise DeclarationError(words)
     names = name_of(skill), name_of(after)
     found = measure(roles.spec, level.skills, *names, done, calls, num_envs, progress.message)

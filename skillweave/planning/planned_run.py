@@ -1,4 +1,4 @@
-"""A hierarchy whose selector is a planner, in an environment that is scored by its task."""
+"""``Run.plan``: a run's skills with a planner, in an environment that is scored by its task."""
 
 from __future__ import annotations
 
@@ -6,38 +6,179 @@ import copy
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, TypeVar
+from functools import partial
+from statistics import fmean
+from typing import Any
 
 import numpy as np
 
-from skillweave._internal.messages import short
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import short, shown_path
+from skillweave._internal.notices import notice
 from skillweave._internal.paths import SELECTOR
 from skillweave._internal.policy_protocol import Policy
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.config import PPO
-from skillweave.api.task_views import OwnSelector, own_skills
-from skillweave.calls import successes
-from skillweave.calls.log import seen_places
-from skillweave.calls.neighbors import FEATURES
-from skillweave.calls.predicates import WORD
+from skillweave.algorithms.config import PPO, AlgorithmConfig
+from skillweave.api import Hierarchy, Run, TrainedPolicy
+from skillweave.calls.log import CallLog
+from skillweave.calls.predicates import WORD, successes
 from skillweave.envs.make import EnvSpec
-from skillweave.errors import DeclarationError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.decisions import as_logits
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.settings import Guide, Selection
-from skillweave.planning import Planner
+from skillweave.planning.forecast import Forecast, forecast, played
 from skillweave.planning.mission import RESERVED
+from skillweave.planning.planner import Planner
 from skillweave.planning.task_env import OwnView, Tasked
+from skillweave.planning.task_views import OwnSelector, own_skills
 from skillweave.runs.initial_policies import Learnt
-from skillweave.skills.skill_set import skills_below
-from skillweave.spaces import obs_codec
+from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.training.imitation import imitate
 
-D = TypeVar("D", bound=Declaration)
+
+class PlannedRun(TrainedPolicy):
+    """Skills of a run with a planner for a new task; nothing of it is written."""
+
+    _kind = "PlannedRun of"
+    _mark = "-plan"
+    _forecast: Forecast | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        if hasattr(Run, name):
+            self._check_written()
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    @checked_names
+    def with_selector(
+        self,
+        algorithm: AlgorithmConfig | None = None,
+        *,
+        steps: int = 100_000,
+        target_kl: float | None = 0.05,
+    ) -> Hierarchy:
+        """Return the skills on the task, with a selector to train that starts from the plan.
+
+        ```python
+        def trained(planned):
+            return planned.with_selector(steps=50_000).train("runs/mission")
+        ```
+
+        Before its training the selector learns to choose as the plan does, in logged observations;
+        then it learns by itself, and the plan guides it. Skills are not trained. The selector also
+        sees the state of the task; skills see what they saw. ``load`` of the same declaration loads
+        the run later.
+
+        Args:
+            algorithm: settings of the selector, ``PPO``; None: ``PPO()``.
+            steps: training steps of the selector.
+            target_kl: while it learns, keep the selector within this KL of the plan; None: the plan
+                is its start alone.
+
+        Raises:
+            DeclarationError: an argument is wrong, or the selector cannot start from a plan.
+        """
+        spec = self._own_spec()
+        planner = self.hierarchy.selector
+        assert isinstance(self.policy, HierarchyPolicy)
+        assert isinstance(planner, Planner)
+        config: Any = PPO() if algorithm is None else algorithm
+        declared = Hierarchy(
+            **to_train(spec, self.policy, planner, self.hierarchy.rest, config, target_kl),
+            steps=fitted(AtLeastOne, steps, "with_selector(): steps"),
+        )
+        declared._starts = partial(start_of, planner, self.policy, declared.spec, config)
+        return declared
+
+    @checked_names
+    def explain(self, *, episodes: int = 0) -> Forecast:
+        """Return the calls that the plan intends, its chance and its steps.
+
+        Printed, it is a line. Before the plan is played, episodes are simulated along the logged
+        calls.
+
+        Args:
+            episodes: are played, where that may be done, and chance and steps are theirs; 0: none.
+
+        Raises:
+            RunError: the log has no start of an episode.
+        """
+        planner = self.hierarchy.selector
+        assert isinstance(planner, Planner)
+        if self._forecast is None:
+            self._forecast = forecast(planner)
+        if not fitted(Count, episodes, "explain(): episodes"):
+            return self._forecast
+        found = self.evaluate(episodes, quiet=True)
+        return played(self._forecast, found.succeeded, episodes, fmean(found.lengths))
+
+    def _own_spec(self) -> EnvSpec:
+        return untasked(self.hierarchy.spec)
+
+    def _check_logged(self) -> None:
+        """Raise a DeclarationError: evaluations of a planned run cannot log calls."""
+        raise DeclarationError(
+            "episodes of a planned run end with its task, so the calls in them are cut there: "
+            "leave out log_calls, and record whole calls with "
+            "run.log_calls(choose=run.policy.selector)"
+        )
+
+    def _check_written(self) -> None:
+        raise RunError(
+            "this run was planned, so nothing of it is written or loaded again: use the run that "
+            f"its skills are from, {shown_path(self.path)}, and plan again"
+        )
 
 
-def planned(declared: D, policy: Policy, planner: Planner) -> tuple[D, HierarchyPolicy]:
+def plan(
+    run: TrainedPolicy,
+    task: Any,
+    log: CallLog | None,
+    *,
+    predicates: Mapping[str, Any] | None,
+    features: Any,
+    neighbors: int,
+    gamma: float,
+    caution: float,
+    temperature: float,
+) -> PlannedRun:
+    """Return a run's skills with a planner of a task; see ``Run.plan``."""
+    declared = run.hierarchy
+    if log is None:
+        log = run.calls
+    elif isinstance(log, CallLog):
+        log.check_environment(run._own_spec())
+    if isinstance(task, str):
+        words = {} if predicates is None else predicates
+        if isinstance(words, Mapping):  # else the planner says what it is
+            predicates = mission_words(declared, words)
+    planner = Planner(
+        log,
+        task,
+        predicates=predicates,
+        skills=run.policy,
+        features=declared.features if features is None else features,
+        neighbors=neighbors,
+        gamma=gamma,
+        caution=caution,
+        temperature=temperature,
+    )
+    hierarchy, policy = with_planner(declared, run.policy, planner)
+    planned = PlannedRun(hierarchy, run.path, policy)
+    # Each goal of its own would need a plan of its own now.
+    if planner.already:
+        notice(planner.already)
+    if planner.plan.size and (expected := planned.explain()).reason:
+        share = expected.chance
+        chance = "no known chance" if share is None else f"a chance of {share:.0%}"
+        notice(f"this plan has {chance}: {expected.reason}")
+    return planned
+
+
+def with_planner(
+    declared: Hierarchy, policy: Policy, planner: Planner
+) -> tuple[Hierarchy, HierarchyPolicy]:
     """Return a hierarchy and its policy with a planner in place of the outermost selector.
 
     Its environment has the task's reward and ends, so that evaluations, films and players are about
@@ -160,24 +301,6 @@ def mission_words(declared: Declaration, given: Mapping[str, Any]) -> dict[str, 
         if name not in RESERVED and re.fullmatch(WORD, name)
     }
     return {**own, **declared.predicates, **given}
-
-
-def lacking_features(declared: Declaration, policy: Policy, skill: str | None = None) -> str:
-    """Return a sentence if skills see images, by which calls cannot be compared; it may be empty.
-
-    Args:
-        policy: with the skills, of the whole hierarchy or of one level.
-        skill: the name of the one that counts; None: all do.
-    """
-    skills = skills_below(policy)
-    features = declared.features
-    if skills is None or not obs_codec(declared.spec.spaces.observation).images:
-        return ""
-    for one, places in zip(skills.skills, seen_places(skills), strict=True):
-        own = features.get(one.name) if isinstance(features, Mapping) else features
-        if places is None and own is None and skill in (None, one.name):
-            return f"calls of {one.name!r} cannot be compared by images; {FEATURES}"
-    return ""
 
 
 def untasked(spec: EnvSpec) -> EnvSpec:

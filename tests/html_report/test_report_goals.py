@@ -11,11 +11,11 @@ import pytest
 from goals.worlds import SPACES, Drawn, GoTo, Rest, aim_of, declared
 
 from skillweave import Run
-from skillweave.reporting.report.charts import choices
-from skillweave.reporting.report.matrix import add_handover
-from skillweave.reporting.report.page import Page
-from skillweave.reporting.report.single import Played, play_episodes
-from skillweave.reporting.report.timelines import decision_data
+from skillweave.html_report.charts import choices
+from skillweave.html_report.matrix import add_handover
+from skillweave.html_report.page import Page
+from skillweave.html_report.single import Played, play_episodes
+from skillweave.html_report.timelines import decision_data
 from skillweave.skills.goal_spaces import shown_goal
 
 

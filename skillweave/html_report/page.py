@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.errors import SkillweaveError, needs_extra
-from skillweave.reporting.report.facts import percent
+from skillweave.reporting.facts import percent
 from skillweave.runs.files import write_bytes
 
 LOCAL = Path(__file__).parent / "templates"

@@ -15,7 +15,7 @@ import numpy as np
 
 from skillweave.errors import DeclarationError
 from skillweave.policies.core import Array
-from skillweave.reporting.report import facts
+from skillweave.reporting import facts
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import settings_of
 from skillweave.training.evaluation import interquartile_means

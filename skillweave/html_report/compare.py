@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.reporting.palette import color_of, hex_of
-from skillweave.reporting.report import charts, facts
-from skillweave.reporting.report.curves import Curves, metrics_of, read_curves
-from skillweave.reporting.report.facts import (
+from skillweave.html_report import charts
+from skillweave.html_report.page import Page, library
+from skillweave.html_report.timelines import rounded
+from skillweave.reporting import facts
+from skillweave.reporting.curves import Curves, metrics_of, read_curves
+from skillweave.reporting.facts import (
     NOTHING,
     is_binary,
     number,
@@ -22,15 +24,14 @@ from skillweave.reporting.report.facts import (
     transition_rows,
     transitions,
 )
-from skillweave.reporting.report.groups import (
+from skillweave.reporting.groups import (
     Group,
     differences,
     grouped,
     on_one_grid,
     over_seeds,
 )
-from skillweave.reporting.report.page import Page, library
-from skillweave.reporting.report.timelines import rounded
+from skillweave.reporting.palette import color_of, hex_of
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation

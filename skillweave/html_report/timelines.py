@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from skillweave.envs.obs_names import ObsNames
+from skillweave.html_report.film import Mp4
 from skillweave.policies.core import Array
-from skillweave.reporting.report.film import Mp4
 from skillweave.training.played_calls import Episode, PlayedEpisodes
 
 MOST_COORDINATES = 16

@@ -14,9 +14,9 @@ from reporting.cart import RECIPE
 from reporting.walkway import CALLS, declare
 
 from skillweave.cli import main
-from skillweave.reporting.report.compare import write_comparison
-from skillweave.reporting.report.film import HOLD
-from skillweave.reporting.report.single import write_report
+from skillweave.html_report.compare import write_comparison
+from skillweave.html_report.film import HOLD
+from skillweave.html_report.single import write_report
 from skillweave.runs.directory import RunDirectory
 
 BROWSER = next(

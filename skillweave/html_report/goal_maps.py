@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.paths import join
-from skillweave.calls import CallLog
+from skillweave.calls.log import CallLog
+from skillweave.html_report import charts
 from skillweave.policies.core import Array
-from skillweave.reporting.report import charts
-from skillweave.reporting.report.facts import percent
+from skillweave.reporting.facts import percent
 from skillweave.skills import Skill
 
 MOST_GOALS = 40

@@ -14,10 +14,10 @@ from small_runs import stage_entry
 
 from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
 from skillweave.envs.obs_names import GYMNASIUM
-from skillweave.reporting.report import timelines
-from skillweave.reporting.report.compare import write_comparison
-from skillweave.reporting.report.facts import about, no_verdict, number, percent, verdict
-from skillweave.reporting.report.single import score_words
+from skillweave.html_report import timelines
+from skillweave.html_report.compare import write_comparison
+from skillweave.html_report.single import score_words
+from skillweave.reporting.facts import about, no_verdict, number, percent, verdict
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation

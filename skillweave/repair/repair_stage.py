@@ -11,19 +11,20 @@ from typing import Any
 import numpy as np
 
 from skillweave._internal.paths import level_of, name_of
-from skillweave.calls import CallLog, Handover, join
-from skillweave.calls.handover import before_each, calls_done, shown_rate
+from skillweave.calls.handover import Handover, before_each, calls_done, shown_rate
+from skillweave.calls.log import CallLog, join
 from skillweave.calls.predicates import Held, as_event
 from skillweave.calls.record import RandomChoice, with_returns
 from skillweave.envs.make import EnvSpec
 from skillweave.experience.search import NAMED_SHARE, Starts
+from skillweave.hierarchy.added_stages import AddedStage
 from skillweave.hierarchy.assembly import parts_of, policy_at
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles
 from skillweave.policies.core import Array, Memory, Step, Turn
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import Matrix, RepairEntry, StageEntry
+from skillweave.runs.manifest import Matrix, StageEntry
 from skillweave.skills import Skill
 from skillweave.skills.goals import goals_of
 from skillweave.skills.own_part import OwnPart
@@ -79,17 +80,14 @@ class Repair:
         return f"{self.blame}\nbefore\n{self.before}\nafter\n{self.later}\n{self.sentence}"
 
 
-def repair_stage(
-    roles: Roles,
-    entry: StageEntry,
-    repair: RepairEntry,
-    done: Mapping[str, Any] | None = None,
-) -> Stage:
+def repair_stage(roles: Roles, entry: StageEntry, done: Mapping[str, Any] | None) -> Stage:
     """Return the stage of a run's entry in which a skill is repaired.
 
     Args:
         done: as for ``handover``.
     """
+    repair = entry.repair
+    assert repair is not None
     path = repair.skill
     level = roles.levels[level_of(path)]
     role = roles[path]
@@ -351,14 +349,14 @@ def matrix_from_json(entry: Matrix) -> Handover:
     return Handover(tuple(entry.skills), calls, done, late, by_itself, limit, needed)
 
 
-def judge_repair(
-    roles: Roles, course: Course, entry: StageEntry, repair: RepairEntry, later: HierarchyPolicy
-) -> bool:
-    """Measure a repaired skill once, and record in the run whether it is kept; return that.
+def judge_repair(roles: Roles, course: Course, entry: StageEntry, later: HierarchyPolicy) -> bool:
+    """Measure a repaired skill once, record in the run whether it is kept, and return that.
 
     Args:
         later: the hierarchy with the repaired weights.
     """
+    repair = entry.repair
+    assert repair is not None
     if entry.kept is None:
         level = parts_of(roles, later)[level_of(repair.skill)]
         assert isinstance(level, HierarchyPolicy)
@@ -374,6 +372,10 @@ def judge_repair(
         course.run.save()
         tell(sentence)
     return not entry.undone
+
+
+REPAIR = AddedStage(make=repair_stage, judge=judge_repair)
+"""The kind of stage in which a skill is repaired."""
 
 
 def verdict(before: Handover, later: Handover, skill: str, after: str) -> tuple[bool, str]:

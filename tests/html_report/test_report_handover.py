@@ -13,10 +13,10 @@ from reporting.walkway import Walkway, declare
 
 from skillweave import EnvSpec
 from skillweave.calls import CallLog
-from skillweave.reporting.report import film, matrix as page
-from skillweave.reporting.report.film import HOLD
-from skillweave.reporting.report.matrix import add_handover
-from skillweave.reporting.report.page import Page
+from skillweave.html_report import film, matrix as page
+from skillweave.html_report.film import HOLD
+from skillweave.html_report.matrix import add_handover
+from skillweave.html_report.page import Page
 from skillweave.runs.directory import CALLS
 
 pytest.importorskip("imageio_ffmpeg")

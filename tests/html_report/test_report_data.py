@@ -14,13 +14,13 @@ from reporting.walkway import CALLS, Moody, Walkway, declare, played, told
 from skillweave import EnvSpec, SkillweaveError
 from skillweave.cli import main
 from skillweave.errors import EnvError
+from skillweave.html_report import timelines
+from skillweave.html_report.charts import scores
+from skillweave.html_report.film import HOLD, episode_shot, make_film
+from skillweave.reporting.curves import read_curves, thinned
+from skillweave.reporting.facts import transition_rows, transitions
+from skillweave.reporting.groups import grouped, on_one_grid, over_seeds
 from skillweave.reporting.palette import hex_of, is_light
-from skillweave.reporting.report import timelines
-from skillweave.reporting.report.charts import scores
-from skillweave.reporting.report.curves import read_curves, thinned
-from skillweave.reporting.report.facts import transition_rows, transitions
-from skillweave.reporting.report.film import HOLD, episode_shot, make_film
-from skillweave.reporting.report.groups import grouped, on_one_grid, over_seeds
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import episode_seeds
 from skillweave.training.played_calls import Episode

@@ -1,0 +1,1 @@
+"""``skillweave demo``: two tasks that are trained, scored and filmed in minutes."""
