@@ -38,12 +38,13 @@ BASE = {
     "shapes",
     "paths",
     "prefixes",
+    "extensions",
 }
 USED = {"algorithms", "envs", "errors", "evolution", "types"}  # users import from these, too
 LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
 LEARNING |= {"experience", "workers", "calls"}
 CENTRE = LEARNING | {"training", "hierarchy", "evolution", "reporting", "export"}
-CORE = CENTRE | {"shipped", "api", "extensions", "cli", "skillweave"}
+CORE = CENTRE | {"shipped", "api", "cli", "skillweave"}
 # What each extension may import beside the core: the extensions that it stands on.
 EXTENSIONS: dict[str, set[str]] = {
     "planning": set(),
@@ -75,7 +76,7 @@ ROOMS: dict[str, set[str]] = {
     "named": {"errors", "messages"},
     "schema": {"errors", "messages", "arguments", "policies"},
     "_internal": set(),
-    "extensions": {"errors"},
+    "extensions": {"errors", "messages", "notices"},
     "interrupts": {"terminal"},
     "ops": BASE,
     "spaces": BASE,
@@ -88,18 +89,16 @@ ROOMS: dict[str, set[str]] = {
     "experience": BASE | {"spaces", "skills", "envs", "algorithms"},
     "workers": BASE | {"envs", "algorithms", "experience"},
     "runs": BASE | {"algorithms", "skills", "envs"},
-    "calls": BASE
-    | {"ops", "spaces", "skills", "envs", "algorithms", "experience", "runs"}
-    | {"extensions"},
+    "calls": BASE | {"ops", "spaces", "skills", "envs", "algorithms", "experience", "runs"},
     "training": LEARNING,
-    "hierarchy": LEARNING | {"training", "extensions"},
+    "hierarchy": LEARNING | {"training"},
     "evolution": LEARNING | {"training"},
     "export": LEARNING | {"training", "hierarchy"},
     "reporting": BASE | {"spaces", "skills", "envs", "runs", "calls", "training", "hierarchy"},
     "shipped": {"errors"},
-    "api": CENTRE | {"shipped", "extensions"},
+    "api": CENTRE | {"shipped"},
     "types": {"public", "policies", "policy_protocol", "training", "hierarchy", "export"},
-    "cli": CENTRE | {"shipped", "extensions", "api", "skillweave"},
+    "cli": CENTRE | {"shipped", "api", "skillweave"},
     "skillweave": CENTRE | {"api", "types"},  # the package itself: public names
     "__main__": {"cli"},
     **{name: CORE | below for name, below in EXTENSIONS.items()},

@@ -62,6 +62,8 @@ PUBLIC = {
         "evolution.config": "Evolution Mutations Range Tournament Truncation",
         "evolution.selection": "Heir ParentSelection",
     },
+    "skillweave.extensions": {"extensions": "fetch"},
+    "skillweave.html_report": {"html_report.sections": "Reported Section"},
     "skillweave.planning": {
         "planning.explorer": "Explorer",
         "planning.forecast": "Forecast",

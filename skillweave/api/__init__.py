@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import gymnasium as gym
 
 from skillweave._internal.arguments import checked_names
-from skillweave._internal.extensions import fetch
 from skillweave._internal.messages import as_path, short, shown_path
 from skillweave._internal.paths import AGENT, join, level_of, name_of
 from skillweave._internal.policy_protocol import Memory, Policy
@@ -47,6 +46,7 @@ from skillweave.envs.make import EngineName, EnvSpec
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.evolving import Evolve
 from skillweave.export.write import Export, write_export
+from skillweave.extensions import fetch
 from skillweave.hierarchy.assembly import parts_of
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone

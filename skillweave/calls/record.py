@@ -12,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.arguments import checked_names
-from skillweave._internal.extensions import fetch
 from skillweave._internal.interrupts import deferred, requested
 from skillweave._internal.messages import short
 from skillweave._internal.seeding import Seeds, global_generators
@@ -22,6 +21,7 @@ from skillweave.envs.engine import Engine, GymnasiumEngine, episode_seed
 from skillweave.envs.env_infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError, Interrupted
+from skillweave.extensions import fetch
 from skillweave.policies.core import (
     Around,
     Array,

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,8 +14,10 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
-from skillweave._internal.extensions import COMMANDS, fetch_from
+from skillweave._internal.messages import error_text
+from skillweave._internal.notices import notice
 from skillweave.errors import MissingExtra
+from skillweave.extensions import fetch_from, names_of
 
 Out = Annotated[Path, arg(aliases=["-o"])]
 """A place to write to."""
@@ -315,18 +316,22 @@ def name_of(command: type) -> str:
 def all_commands() -> dict[str, CommandEntry]:
     """Return the commands of the core and of the extensions that are installed, by name."""
     entries = {name_of(entry[0]): entry for entry in OWN}
-    for name in COMMANDS:
-        with suppress(MissingExtra):
-            entries[name] = fetch_from(COMMANDS, name)
+    for name in names_of("command"):
+        try:
+            entries[name] = fetch_from("command", name)
+        except MissingExtra:
+            continue  # ``missing`` says so where it is called
+        except Exception as error:  # of another package, which must not end all commands
+            notice(f"the command {name!r} cannot be loaded: {error_text(error)}")
     return entries
 
 
 def missing(words: Sequence[str]) -> str:
     """Return a sentence where words name a command of an extension that is not installed."""
-    if not words or words[0] not in COMMANDS:
+    if not words or words[0] not in names_of("command"):
         return ""
     try:
-        fetch_from(COMMANDS, words[0])
+        fetch_from("command", words[0])
     except MissingExtra as error:
         return str(error)
     return ""

@@ -25,6 +25,7 @@ from skillweave.cli.output import Result, run_words, save_score
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.targets import lacking_words, load_target, load_with_code
 from skillweave.errors import DeclarationError, RunError
+from skillweave.extensions import load
 from skillweave.hierarchy.recorded import calls_of
 from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
@@ -43,14 +44,8 @@ def run(command: commands.Output) -> Result:
             if isinstance(word, Path) or (word and field.name in ("recipe", "target")):
                 as_path(word, field.name)
     by_kind = dict(commands.all_commands().values())
-    return way_of(by_kind[type(command)])(command)
-
-
-def way_of(name: str) -> Callable[[Any], Result]:
-    """Return the function that carries out a command, by ``module:function``."""
-    module, _, function = name.partition(":")
-    found: Callable[[Any], Result] = getattr(importlib.import_module(module), function)
-    return found
+    way: Callable[[Any], Result] = load(by_kind[type(command)])
+    return way(command)
 
 
 def evaluate(command: commands.EvaluateCommand) -> Result:

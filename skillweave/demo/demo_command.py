@@ -12,14 +12,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from skillweave import recipes
 from skillweave._internal.messages import shown_path
 from skillweave._internal.terminal import put_result
 from skillweave.api import Hierarchy, Run
 from skillweave.cli.output import Result, save_score
 from skillweave.demo.commands import DemoCommand
 from skillweave.errors import MissingExtra, RunError
-from skillweave.recipes import lander_missions as missions
+from skillweave.recipes import lander_missions as missions, load
 from skillweave.training.evaluation import Evaluation
 
 MISSION = "tour"
@@ -58,7 +57,7 @@ class Demo:
     def lander(self) -> None:
         """Learn LunarLander with the tutorial's three skills."""
         name = "lunar-lander"
-        hierarchy = recipes.load(name)
+        hierarchy = load(name)
         hierarchy.scale(self.command.scale)
         self.say("1. Land softly (LunarLander-v3): three skills and a selector learn from nothing.")
         run, score, seconds = self._learn(hierarchy, name, name)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from skillweave._internal.extensions import STAGES, fetch_from
+from skillweave.extensions import fetch_from
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles
 from skillweave.runs.manifest import StageEntry
@@ -32,5 +32,5 @@ def added_stage(kind: str) -> AddedStage:
     Raises:
         MissingExtra: its extension is not installed.
     """
-    found: AddedStage = fetch_from(STAGES, kind)
+    found: AddedStage = fetch_from("stage", kind)
     return found

@@ -20,6 +20,7 @@ from skillweave.html_report.film import episode_shot, make_film
 from skillweave.html_report.goal_maps import goal_pictures
 from skillweave.html_report.matrix import add_handover
 from skillweave.html_report.page import Page, library
+from skillweave.html_report.sections import Reported, add_sections
 from skillweave.html_report.timelines import (
     chosen_episodes,
     decision_data,
@@ -141,6 +142,8 @@ def write_report(
     _add_words(page, run, reached)
     _add_scores(page, run, played, seed, deterministic)
     _add_lineages(page, run, colors)
+    score = None if played is None else played.score
+    add_sections(page, Reported(run, policy, spec, score, log))
     pictures = enumerate(page.context["goals"])
     usual = hex_of(color_of(1))
     page.context["metrics"] = metrics_of(all_curves)

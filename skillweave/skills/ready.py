@@ -12,6 +12,7 @@ from gymnasium import Space
 from skillweave._internal.messages import short
 from skillweave._internal.policy_protocol import Policy
 from skillweave.errors import DeclarationError, PolicyError
+from skillweave.extensions import fetch_from, names_of
 from skillweave.policies.parts import GOAL
 from skillweave.skills.base import Skill, is_trained
 from skillweave.skills.foreign_policy import fitted
@@ -44,7 +45,7 @@ def _as_policy(value: Any, skill: Skill) -> Policy:
 
 
 def as_policy(value: Any, where: str) -> Policy:
-    """Return a policy as it is, a torch module or a function of observations as a policy.
+    """Return a policy as it is; a torch module, a function or a file as one that acts.
 
     Raises:
         DeclarationError: it cannot act; ``where`` begins the message.
@@ -71,18 +72,22 @@ def as_policy(value: Any, where: str) -> Policy:
     )
     if hasattr(value, "predict") and hasattr(value, "observation_space"):
         advice = "a model of Stable-Baselines3 acts by from_sb3(model)"
-    elif isinstance(value, str | Path) and (make := FILES.get(Path(value).suffix)):
-        advice = f"a file acts by {make.format(str(value))}"
+    elif isinstance(value, str | Path):
+        suffix = Path(value).suffix
+        if suffix[1:] in names_of("reader"):
+            read: Policy = fetch_from("reader", suffix[1:])(value)
+            return read
+        if make := FILES.get(suffix):
+            advice = f"a file acts by {make.format(str(value))}"
     raise DeclarationError(f"{where} is {short(value)}, which cannot act; {advice}")
 
 
 FILES = {
-    ".onnx": "from_onnx({!r})",
     ".zip": "from_sb3({!r}, algorithm, trust=True)",
     ".pt": "from_torch({!r}, trust=True)",
     ".pt2": "from_torch({!r}, trust=True)",
 }
-"""Calls that make a policy of a file, by its suffix."""
+"""Calls that make a policy of a file which may run code, by its suffix."""
 
 
 PART = ", of which the skill has a part (sees, acts),"

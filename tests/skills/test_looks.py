@@ -313,6 +313,6 @@ def test_evaluate_takes_what_a_skill_takes_or_says_how_it_acts():
     score = sw.evaluate(module, "CartPole-v1", episodes=2)
     assert score.returns == sw.evaluate(sw.from_torch(module), "CartPole-v1", episodes=2).returns
     assert sw.evaluate(lambda obs: np.zeros(len(obs), int), "CartPole-v1", episodes=2).mean < 15
-    for wrong, says in (("net.onnx", r"from_onnx\('net.onnx'\)"), (nn.Linear, "class"), (3, "act")):
+    for wrong, says in (("net.zip", r"from_sb3\('net.zip'"), (nn.Linear, "class"), (3, "act")):
         with pytest.raises(SkillweaveError, match=rf"evaluate\(\): policy is .*{says}"):
             sw.evaluate(wrong, "CartPole-v1", episodes=2)

@@ -250,7 +250,7 @@ def places() -> dict[str, list[Callable[[], Any]]]:
     return {
         "experience.judges": [achieves()],
         "planning.goal": [lambda: task.holds(OBS, OBS)],
-        "planning.predicates": [lambda: inverse.at(OBS)],
+        "calls.predicates": [lambda: inverse.at(OBS)],
         "skills.selector": [
             chooses(Automaton({"x": "a", "y": "b"}, {("x", "y"): Best()})),
             chooses(tree.Fallback(tree.Sequence(Best(), "a"), "b")),
