@@ -8,6 +8,7 @@ import re
 import signal
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # here, in each worker, and in what tests start
 
@@ -30,6 +31,22 @@ if importlib.util.find_spec("jaxtyping") and importlib.util.find_spec("beartype"
     check_shapes("returns", "losses", "distributions", "optim")
 
 
+EXTENSIONS = ("planning", "html_report", "repair", "recipes", "demo", "compat")
+
+
+def is_missing(extension: str) -> bool:
+    """Whether an extension is not installed, as where somebody works on the core alone."""
+    return importlib.util.find_spec(f"skillweave.{extension}") is None
+
+
+def pytest_ignore_collect(collection_path: Path) -> bool | None:
+    """Leave out files that import an extension which is not installed."""
+    if collection_path.suffix != ".py":
+        return None
+    found = re.findall(r"^from skillweave(?: import |\.)(\w+)", collection_path.read_text(), re.M)
+    return True if any(name in EXTENSIONS and is_missing(name) for name in found) else None
+
+
 # Reasons of tests that would run if something were installed; others want a GPU or a small disk.
 WANTING = re.compile(
     r"could not import|not installed|no browser|no EGL|no C\+\+ compiler", re.IGNORECASE
@@ -38,9 +55,15 @@ WANTING = re.compile(
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark as slow all but the first n cases of a test with ``@pytest.mark.fast_cases(n)``."""
+    """Mark what is slow, and skip what needs an extension that is not installed.
+
+    Of a test with ``@pytest.mark.fast_cases(n)`` all cases but the first n are slow.
+    """
     seen: Counter[str] = Counter()
     for item in items:
+        for mark in item.iter_markers("needs"):
+            if missing := [name for name in mark.args if is_missing(name)]:
+                item.add_marker(pytest.mark.skip(reason=f"{missing[0]} is not there"))
         limit = item.get_closest_marker("fast_cases")
         if limit is None:
             continue
@@ -95,6 +118,9 @@ def few_episodes() -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def short_forecasts() -> Iterator[None]:
     """A plan is forecast by a few episodes, each time that one is made."""
+    if is_missing("planning"):
+        yield
+        return
     from skillweave.planning import forecast
 
     assert forecast.EPISODES == 200, "as usual_forecasts has it"

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from ready_selectors.watching import watched
 
 from skillweave.calls import Predicate
 from skillweave.planning import Planner
-from skillweave.policies.core import LIMIT, flat, nested
-from skillweave.skills import LastCall, ReadySelector
+from skillweave.policies.core import LIMIT
+from skillweave.skills import LastCall
 from skillweave.types import Array, Step
 
 
@@ -30,13 +31,6 @@ def step_to(after, before=None, **more) -> Step:
         "info": {},
     } | more
     return Step(obs=before, next_obs=after, **values)
-
-
-def watched(selector: ReadySelector, memory: Any, step: Step, last: LastCall) -> Any:
-    """The memory of a selector after it has watched a step."""
-    inside = nested(selector.in_place.start(1), {k: v.copy() for k, v in memory.items()})
-    selector.in_place.watch(inside, np.arange(len(last.why)), step, last)
-    return flat(inside)
 
 
 def column(i: int):

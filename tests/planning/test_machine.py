@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from planning.steps import column, step_to, watched
+from planning.steps import column, step_to
+from ready_selectors.watching import watched
 
 from skillweave.calls import Predicate, held, successes
 from skillweave.errors import DeclarationError, SkillError

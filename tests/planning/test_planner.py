@@ -11,7 +11,7 @@ import pytest
 from call_logs.logs import log_of
 from call_logs.untrained import SKILLS, skill_set
 from goals.worlds import Point
-from planning.steps import assert_not_repeated, at, step_to, watched
+from planning.steps import assert_not_repeated, at, step_to
 from ready_selectors.chain import (
     DOOR,
     KEY,
@@ -21,6 +21,7 @@ from ready_selectors.chain import (
     InDict,
     has_key,
 )
+from ready_selectors.watching import watched
 from toys import skills_of
 
 from skillweave import EnvSpec, Hierarchy, evaluate

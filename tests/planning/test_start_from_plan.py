@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from call_logs.logs import log_of
 from call_logs.untrained import run_of
-from planning.steps import step_to, watched
+from planning.steps import step_to
 from ready_selectors.chain import (
     DOOR,
     KEY,
@@ -24,6 +24,7 @@ from ready_selectors.chain import (
     has_key,
     hierarchy,
 )
+from ready_selectors.watching import watched
 from small_runs import lines
 
 import skillweave as sw

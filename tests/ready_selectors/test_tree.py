@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from planning.steps import watched
+from ready_selectors.watching import watched
 
 from skillweave import tree
 from skillweave.errors import SkillError
