@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave._internal.policy_protocol import Memory, Memoryless
 from skillweave.algorithms.base import OBS_STATS, Algorithm
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.parameters import ParameterGroup
@@ -21,23 +20,23 @@ from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.networks.net import seen_places
 from skillweave.ops.seen import Seen
-from skillweave.policies.core import Array
+from skillweave.policies.core import Array, Memory, RowPolicy, Turn
+from skillweave.policies.functional import Functional
 from skillweave.spaces import pack, space_from_json, space_to_json, to_tensor
 
 S = TypeVar("S")
 
 
-class AgentPolicy(Memoryless):
+class AgentPolicy(Functional):
     """A trained agent that acts; a copy, independent of further learning."""
 
     _seen: Seen | None = None
 
     def __init__(self, algorithm: Algorithm, weights: dict[str, Tensor]) -> None:
+        super().__init__(TrainedNetwork(self), algorithm.observation_space, algorithm.action_space)
         self.algorithm = algorithm
         self.weights = weights
         self.params = algorithm.acting_params_of(weights)
-        self.observation_space = algorithm.observation_space
-        self.action_space = algorithm.action_space
 
     @classmethod
     def of(cls, algorithm: Algorithm, state: Any, member: int = 0) -> AgentPolicy:
@@ -50,6 +49,11 @@ class AgentPolicy(Memoryless):
             stats = (self.weights[k] for k in OBS_STATS)
             self._seen = Seen(f"{who}: observation number", *stats)
 
+    def look(self, rows: Tensor) -> None:
+        """Give a notice of observations (1, n, ...) far beyond those that it learnt from."""
+        if self._seen is not None:
+            self._seen.look(self.algorithm.obs.split(rows)[0])
+
     @property
     def seen_places(self) -> tuple[int, ...] | None:
         """The places in the flat observation that its network sees; None: all."""
@@ -58,37 +62,6 @@ class AgentPolicy(Memoryless):
             return None
         assert isinstance(network, Network)
         return seen_places(network, self.algorithm.obs)
-
-    def start(self, n: int) -> Memory:
-        """Return the initial recurrent state, zeros (n, M); empty if the network has none."""
-        size = self.algorithm.memory_size
-        return {"rnn": np.zeros((n, size), np.float32)} if size else {}
-
-    @torch.inference_mode()
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return actions (n, ...) in the environment's units; greedy, or sampled with ``rng``."""
-        noise = None
-        if not deterministic:
-            rng = rng or np.random.default_rng()
-            generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-            noise = self.algorithm.noise([generator], 1, len(obs))[0]
-        mask = self.algorithm.widened(mask)
-        allowed = None if mask is None else torch.from_numpy(mask)[None]
-        rows = to_tensor(np.ascontiguousarray(pack(self.observation_space, obs)))[None]
-        if self._seen is not None:
-            self._seen.look(self.algorithm.obs.split(rows)[0])
-        before = torch.from_numpy(memory["rnn"])[None] if memory else None
-        action, _, after = self.algorithm.act(self.params, rows, allowed, noise, before)
-        memory = {} if after is None else {"rnn": after[0].numpy()}
-        return self.algorithm.to_env(action[0].numpy()), memory
 
     @torch.inference_mode()
     def heads(self, obs: Array) -> Array:
@@ -139,6 +112,42 @@ class AgentPolicy(Memoryless):
         policy = cls(algorithm, weights)
         policy.name_outliers(where)
         return policy
+
+
+class TrainedNetwork(RowPolicy):
+    """The network of a trained agent, as it acts.
+
+    Args:
+        agent: whose network it is.
+    """
+
+    def __init__(self, agent: AgentPolicy) -> None:
+        self.agent = agent
+
+    def start(self, n: int) -> Memory:
+        """Return the initial recurrent state, zeros (n, M); empty if the network has none."""
+        size = self.agent.algorithm.memory_size
+        return {"rnn": np.zeros((n, size), np.float32)} if size else {}
+
+    @torch.inference_mode()
+    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return actions (k, ...) in the environment's units; greedy, or sampled."""
+        agent, algorithm = self.agent, self.agent.algorithm
+        noise = None
+        if not turn.greedy:
+            rng = turn.world.rng or np.random.default_rng()
+            generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+            noise = algorithm.noise([generator], 1, len(obs))[0]
+        mask = algorithm.widened(turn.mask)
+        allowed = None if mask is None else torch.from_numpy(mask)[None]
+        seen = to_tensor(np.ascontiguousarray(pack(agent.observation_space, obs)))[None]
+        agent.look(seen)
+        before = torch.from_numpy(memory["rnn"][rows])[None] if "rnn" in memory else None
+        action, _, after = algorithm.act(agent.params, seen, allowed, noise, before)
+        if after is not None:
+            memory["rnn"][rows] = after[0].numpy()
+        in_env: Array = algorithm.to_env(action[0].numpy())
+        return in_env
 
 
 @dataclass

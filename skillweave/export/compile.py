@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from skillweave._internal.policy_protocol import Policy
-from skillweave.algorithms.agent_policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy, TrainedNetwork
 from skillweave.errors import PolicyError
 from skillweave.export.foreign import as_file
 from skillweave.export.graphs import agent_graph, worth_graph
@@ -68,8 +68,10 @@ def _compiled(policy: RowPolicy, name: str, *, sampled: bool) -> RowPolicy:
             return made
         case Mapped():
             return as_file(policy, where, sampled=sampled)
+        case TrainedNetwork():
+            return agent_graph(policy.agent, sampled, where)
         case Returns():
-            return _leaf(policy, where, sampled)
+            return _function(policy, where)
         case Planned() if type(policy) is not Planned:
             raise PolicyError(
                 f"{name} plans again for each goal that it observes, which the runner does not: "
@@ -78,11 +80,9 @@ def _compiled(policy: RowPolicy, name: str, *, sampled: bool) -> RowPolicy:
     return policy
 
 
-def _leaf(policy: Returns, where: str, sampled: bool) -> RowPolicy:
-    """Return a leaf of the exported tree: a network, or a user's function."""
+def _function(policy: Returns, where: str) -> RowPolicy:
+    """Return a user's policy for an export: a function without a memory."""
     inside = policy.policy
-    if isinstance(inside, AgentPolicy):
-        return agent_graph(inside, sampled, where)
     if inside.start(1):
         kind = type(inside).__name__
         raise PolicyError(

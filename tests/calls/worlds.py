@@ -18,11 +18,13 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
 
 import skillweave as sw
-from skillweave.algorithms.agent_policy import AgentPolicy
+from skillweave.algorithms.agent_policy import AgentPolicy, TrainedNetwork
 from skillweave.hierarchy.assembly import assembled, learning_set
 from skillweave.hierarchy.fitting import active_guide, ready_policies, ready_selectors
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles, roles_of
+from skillweave.policies.core import Turn
+from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.skills.goal_spaces import blank_choices
 from skillweave.skills.scripted import ScriptedPolicy
@@ -545,10 +547,7 @@ class Network(AgentPolicy):
 
     def __init__(self, salt: str, acts: Any, recurrent: bool) -> None:
         self.salt, self.acts, self.size = salt, acts, int(recurrent)
-        self.action_space = acts
-
-    def start(self, n: int) -> Memory:
-        return {"rnn": np.zeros((n, 1), np.float32)} if self.size else {}
+        Functional.__init__(self, InPlace(self), None, acts)
 
     def answer(self, memory: Memory, named: Any, deterministic: bool, size: int) -> Any:
         """(n, size) numbers that follow from what it is given, and what it then remembers."""
@@ -563,16 +562,25 @@ class Network(AgentPolicy):
         x, after = self.answer(memory, named, deterministic, width(self.acts))
         return as_action(x, self.acts, mask), after
 
-    def act(
-        self, memory: Memory, obs: Any, mask: Any = None, *, deterministic: bool = True,
-        rng: Any = None,
-    ) -> Any:  # fmt: skip
-        found, after = self.named(memory, leaves(obs, "obs"), mask, deterministic)
-        return self.packed(found), after
-
     def packed(self, found: Any) -> Array:
         """What ``named`` returned, as the library has it."""
         return packed(found, self.action_space)
+
+
+class InPlace(TrainedNetwork):
+    """How a stand-in acts."""
+
+    agent: Network
+
+    def start(self, n: int) -> Memory:
+        return {"rnn": np.zeros((n, 1), np.float32)} if self.agent.size else {}
+
+    def act(self, memory: Memory, rows: Array, obs: Any, turn: Turn) -> Any:
+        own = {"rnn": memory["rnn"][rows]} if self.agent.size else {}
+        found, after = self.agent.named(own, leaves(obs, "obs"), turn.mask, turn.greedy)
+        for name, value in after.items():
+            memory[name][rows] = value
+        return self.agent.packed(found)
 
 
 class Chooser(Network):
