@@ -13,6 +13,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
+from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, suggest
 from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, make_error
@@ -49,6 +50,7 @@ OPEN = ("function", "command", "reader", "section")
 """The kinds to which other packages add names."""
 
 
+@checked_names
 def fetch(name: str) -> Any:
     """Return a function of an extension, by its name.
 

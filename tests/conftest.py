@@ -40,11 +40,20 @@ def is_missing(extension: str) -> bool:
 
 
 def pytest_ignore_collect(collection_path: Path) -> bool | None:
-    """Leave out files that import an extension which is not installed."""
-    if collection_path.suffix != ".py":
-        return None
-    found = re.findall(r"^from skillweave(?: import |\.)(\w+)", collection_path.read_text(), re.M)
-    return True if any(name in EXTENSIONS and is_missing(name) for name in found) else None
+    """Leave out the folder of tests of an extension that is not installed."""
+    name = collection_path.name
+    return True if name in EXTENSIONS and is_missing(name) else None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
+    """Leave out a file that imports an extension which is not installed."""
+    report = yield
+    found = re.search(r"(?:named 'skillweave\.|import name ')(\w+)", str(report.longrepr))
+    if report.failed and found is not None and found[1] in filter(is_missing, EXTENSIONS):
+        report.outcome = "skipped"
+        report.longrepr = str(collector.path), 0, f"skillweave.{found[1]} is not there"
+    return report
 
 
 # Reasons of tests that would run if something were installed; others want a GPU or a small disk.
@@ -63,7 +72,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         for mark in item.iter_markers("needs"):
             if missing := [name for name in mark.args if is_missing(name)]:
-                item.add_marker(pytest.mark.skip(reason=f"{missing[0]} is not there"))
+                item.add_marker(pytest.mark.skip(reason=f"skillweave.{missing[0]} is not there"))
         limit = item.get_closest_marker("fast_cases")
         if limit is None:
             continue

@@ -9,10 +9,10 @@ import pickle
 from importlib import import_module
 
 import pytest
+from installed import HOMES
 
 import skillweave as sw
 from skillweave._internal.arguments import checked_names
-from skillweave._internal.public import HOMES
 from skillweave.errors import DeclarationError
 
 
@@ -55,6 +55,7 @@ INSIDE = {
     "ActingParams", "ActionHead", "AgentState", "Algorithm", "Array", "Encoder", "Evaluation",
     "Export", "LastCall", "Layout", "Net", "OptionsEnv", "ParameterGroup",
     "ParentSelection", "Policy", "Report",
+    "Blame", "CallEnds", "CallLog", "Chain", "Forecast", "Handover", "PlannedRun", "Reported",
     "Rollout", "Run", "Sample", "Seeds", "Skill", "SkillweaveError", "Step", "adam_",
     "clip_grad_norm_", "gae", "mask_logits", "masked_mean", "normalize", "tree",
     *HOMES["skillweave.errors"],

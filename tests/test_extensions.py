@@ -17,6 +17,7 @@ import skillweave as sw
 from skillweave import extensions
 from skillweave.errors import DeclarationError, MissingExtra
 
+pytestmark = pytest.mark.needs(*EXTENSIONS)
 PAGE = ROOT.parent / "docs/howto/extensions.md"
 
 

@@ -13,10 +13,10 @@ from importlib import import_module
 from typing import Any
 
 import pytest
+from installed import HOMES
 from pages import BLOCK, train_briefly
 
 from skillweave import SkillweaveError
-from skillweave._internal.public import HOMES
 from skillweave.cli.commands import all_commands
 from skillweave.errors import KINDS
 from skillweave.types import Array, Policy

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from installed import HOMES
 
 import skillweave as sw
-from skillweave._internal.public import HOMES
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_
 import gymnasium as gym
 import numpy as np
 import pytest
+from installed import HOMES
 
 import skillweave as sw
-from skillweave._internal.public import HOMES
 from skillweave.algorithms import OnPolicy
 from skillweave.algorithms.config import (
     ActorCritic,

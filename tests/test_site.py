@@ -10,9 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from installed import HOMES
 from pages import ROOT
-
-from skillweave._internal.public import HOMES
 
 pytestmark = pytest.mark.slow
 

@@ -11,8 +11,9 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from installed import HOMES
 
-from skillweave._internal.public import ALSO, HOMES
+from skillweave._internal.public import ALSO
 
 ROOT = Path(__file__).parents[1] / "skillweave"
 MODULES = sorted(ROOT.rglob("*.py"))
@@ -76,7 +77,7 @@ ROOMS: dict[str, set[str]] = {
     "named": {"errors", "messages"},
     "schema": {"errors", "messages", "arguments", "policies"},
     "_internal": set(),
-    "extensions": {"errors", "messages", "notices"},
+    "extensions": {"errors", "arguments", "messages", "notices"},
     "interrupts": {"terminal"},
     "ops": BASE,
     "spaces": BASE,

@@ -302,7 +302,7 @@ def test_a_run_in_a_locale_of_ascii(tmp_path):
 
 
 PICTURES = ("html_report/", "reporting/lineage.py", "reporting/curves_figure.py")
-PICTURES += ("reporting/displays.py",)
+PICTURES += ("reporting/displays.py", "reporting/facts.py", "reporting/groups.py")
 """Modules whose texts are drawn, or written to pages and terminals that know all letters."""
 
 
@@ -311,10 +311,8 @@ def test_texts_that_users_may_print_are_ascii():
     wrong = []
     for path in sorted(root.rglob("*.py")):
         name = path.relative_to(root).as_posix()
-        if (
-            name.startswith(PICTURES) or name == "policies/acting_errors.py"
-        ):  # it escapes such letters
-            continue
+        if name.startswith(PICTURES) or name == "policies/acting_errors.py":
+            continue  # the latter escapes such letters
         nodes = list(ast.walk(ast.parse(path.read_text("utf-8"))))
         comments = [x.value for x in nodes if isinstance(x, ast.Expr)]  # docstrings
         wrong += [
@@ -326,6 +324,7 @@ def test_texts_that_users_may_print_are_ascii():
     assert wrong == []
 
 
+@pytest.mark.needs("html_report")
 def test_results_and_errors_can_be_printed_where_the_encoding_knows_ascii_alone(
     tmp_path, monkeypatch
 ):

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave._internal.arguments import checked_names
 from skillweave._internal.policy_protocol import Policy
 from skillweave.calls.call_file import read_calls, write_calls
 from skillweave.calls.columns import columns_of, fields_of
@@ -147,6 +148,7 @@ class CallLog(LinkedCalls):
         return CallLog(**read_calls(path))
 
 
+@checked_names
 def join(logs: Iterable[CallLog]) -> CallLog:
     """Return one log of several, whose episodes are numbered one after another.
 

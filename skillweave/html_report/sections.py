@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import error_text, short
 from skillweave._internal.policy_protocol import Policy
 from skillweave.calls.log import CallLog
@@ -20,6 +21,7 @@ class Reported:
     """What a section of a report is about."""
 
     run: RunDirectory
+    """Of the run; ``run.path`` is its folder."""
     policy: Policy | None
     """The trained policy; None: the run is not finished, or needs code that was not given."""
     spec: EnvSpec | None
@@ -30,11 +32,13 @@ class Reported:
     """The run's log of calls; None: there is none."""
 
 
+@checked_names
 @dataclass(frozen=True)
 class Section:
     """A section of a report, which follows the learning curves."""
 
     title: str
+    """Its heading."""
     html: str
     """Its content, which becomes part of the page as it is: escape what is not your own."""
 

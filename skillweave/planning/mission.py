@@ -219,6 +219,7 @@ def _part(value: Any, where: str) -> Part:
 Task = RewardMachine | GoalTask
 
 
+@checked_names
 def as_task(value: Any, predicates: Mapping[str, Any] | None = None) -> Task:
     """Return a task of any value that means one.
 

@@ -38,6 +38,7 @@ def tilted(obs):
     return obs[:, 2] > 0.05
 
 
+@pytest.mark.needs("planning")
 def test_calls_are_kept_and_joined(run):
     for use in (lambda: run.calls, lambda: run.plan(tilted)):
         with pytest.raises(RunError, match=r"has no log of calls; record a new log: run.log_calls"):
@@ -153,6 +154,7 @@ def test_a_damaged_file_is_neither_used_nor_replaced(run):
         run.log_calls(10)
 
 
+@pytest.mark.needs("planning")
 def test_without_a_directory_calls_stay_in_memory(run, tmp_path):
     weights = run.save_weights(tmp_path / "weights.safetensors")
     loaded = declare(Left(), Right()).load_weights(weights)

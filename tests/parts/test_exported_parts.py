@@ -180,6 +180,7 @@ def test_skills_with_goals_and_parts(case: str, tmp_path: Any) -> None:
     assert len(goals) > 2
 
 
+@pytest.mark.needs("planning")
 def test_a_plan_of_skills_with_goals_and_parts(tmp_path: Any) -> None:
     """Skill, goal and action are the policy's, where observations are a Dict."""
     skill = reach(policy=sw.Residual(to_the_goal, 0.5))

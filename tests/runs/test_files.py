@@ -362,6 +362,7 @@ def test_the_search_for_pickle_finds_it(source: str) -> None:
     assert pickles(source)
 
 
+@pytest.mark.needs("compat")
 def test_nothing_in_the_library_pickles_or_runs_text_as_code() -> None:
     modules = sorted(LIBRARY.rglob("*.py"))
     assert len(modules) > 30

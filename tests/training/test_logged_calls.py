@@ -90,6 +90,7 @@ def assert_whole(log: CallLog, policy, limits: dict[str, int]):
 LIMITS = {"left": 4, "nod": 3, "push": 2}
 
 
+@pytest.mark.needs("planning")
 def test_a_selectors_training_logs_whole_calls_and_learns_the_same(tmp_path):
     without = declare().train(tmp_path / "a", seed=3, quiet=True)
     run = declare().train(tmp_path / "b", seed=3, quiet=True, log_calls=400)

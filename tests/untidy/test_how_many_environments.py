@@ -125,6 +125,7 @@ def test_more_than_can_be_made_is_refused_at_once_with_the_setting(
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("learn", ["apart", "together"])
+@pytest.mark.needs("html_report")
 def test_evaluations_make_no_more_than_training(learn):
     run = hierarchy(learn, 2).train(quiet=True)
     run.evaluate(20)

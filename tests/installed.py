@@ -1,0 +1,10 @@
+"""The public names of what is installed: somebody may work on the core without an extension."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from skillweave._internal import public
+
+HOMES = {module: homes for module, homes in public.HOMES.items() if find_spec(module)}
+"""By module that users import from: its names, each with the module that defines it."""
