@@ -86,6 +86,11 @@ class Policy(Protocol):
         ...
 
 
+def is_policy(value: Any) -> bool:
+    """Return whether a value is a policy, of this library or of the user's own."""
+    return not isinstance(value, type) and hasattr(value, "act") and hasattr(value, "start")
+
+
 class Memoryless:
     """Base class of policies without a state."""
 

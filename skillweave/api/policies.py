@@ -9,7 +9,7 @@ from typing import Any
 from skillweave import schema
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import as_path, short
-from skillweave._internal.policy_protocol import Policy
+from skillweave._internal.policy_protocol import Policy, is_policy
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.export.read import read_policy
@@ -51,7 +51,7 @@ def save_policy(
     folder = as_path(path, "path")
     for name, text in (("license", license), ("origin", origin)):
         schema.fitted(str, text, name)
-    if not (hasattr(policy, "act") and hasattr(policy, "start")):
+    if not is_policy(policy):
         raise DeclarationError(
             f"policy is {short(policy)}, which is no policy; give from_function(...) or "
             "from_torch(...) of it"

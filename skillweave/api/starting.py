@@ -12,6 +12,7 @@ import torch
 from skillweave._internal.messages import as_path, short, suggest
 from skillweave._internal.notices import notice
 from skillweave._internal.paths import AGENT, decides
+from skillweave._internal.policy_protocol import is_policy
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.base import Algorithm
@@ -193,7 +194,7 @@ def _use_of(value: Any) -> tuple[str, str] | None:
             "Network(encoder=function)"
         )
         return f"a {type(value).__name__}, a torch module", as_skill("module") + learns
-    if callable(value) or (hasattr(value, "act") and hasattr(value, "start")):
+    if callable(value) or is_policy(value):
         return f"{short(value)}, a policy", as_skill("this one")
     return None
 

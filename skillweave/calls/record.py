@@ -14,6 +14,7 @@ import numpy as np
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.interrupts import deferred, requested
 from skillweave._internal.messages import short
+from skillweave._internal.policy_protocol import is_policy
 from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.calls.log import CallLog
 from skillweave.calls.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
@@ -240,10 +241,10 @@ def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
         choose.begin(skills.choices)
     if isinstance(choose, RowPolicy):
         return WithDrawnGoals(choose, skills, choices) if goals_in(skills) else choose
-    if isinstance(choose, ReadySelector) or not hasattr(choose, "act"):
+    if isinstance(choose, ReadySelector) or not is_policy(choose):
         if (ready := ready_selector(choose, names)) is not None:
             return ready.bind(engine.observation_space, choices, "selector")
-    elif hasattr(choose, "start") and not isinstance(choose, type):
+    else:
         space = getattr(choose, "action_space", choices)
         if not same_space(space, choices):
             raise DeclarationError(

@@ -27,7 +27,7 @@ from skillweave.policies.core import LIMIT, RUNNING, Array, Step
 from skillweave.runs.user_code import Texts, environment_texts
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goals import Goals, goals_of
-from skillweave.skills.skill_set import SkillSet, skills_below
+from skillweave.skills.skill_set import SkillSet, UntrainedHierarchy, skills_below
 from skillweave.spaces import obs_dtype, obs_shape
 
 SUMS = (
@@ -256,8 +256,7 @@ class Recorder:
             skills.lengths,
             skill_checksums(skills, learning),
             seen_places(skills),
-            # A hierarchy that learns has no policy yet; it remembers its call.
-            tuple(not hasattr(p, "start") or bool(p.start(1)) for p in skills.policies),
+            tuple(map(_remembers, skills.policies)),
             tuple(skill.defines("success") for skill in skills.skills),
             *self.spaces,
             **fields_of(columns),
@@ -510,6 +509,15 @@ def is_endless(skills: SkillSet, i: int) -> bool:
     if skill.max_steps is not None or skill.call_steps is not None or skill.defines("termination"):
         return False
     return skills_below(skills.policies[i]) is None
+
+
+def _remembers(policy: Any) -> bool:
+    """Return whether a skill's policy has a memory within a call; a hierarchy remembers its own.
+
+    Args:
+        policy: None: it learns, and is not there yet.
+    """
+    return policy is None or isinstance(policy, UntrainedHierarchy) or bool(policy.start(1))
 
 
 def _bytes_of(space: gym.Space[Any]) -> int:

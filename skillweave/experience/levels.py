@@ -7,38 +7,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.paths import CRITIC, SELECTOR
-from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.batches import Trace
 from skillweave.experience.acting import Acting
 from skillweave.policies.core import Array, Memory
-from skillweave.policies.hierarchy import ActiveGuide, CallAndReturn, Interruption
+from skillweave.policies.hierarchy import CallAndReturn, Interruption
 from skillweave.policies.leaves import Learning
 from skillweave.skills import Skill
 from skillweave.skills.goals import Goals, goals_of
-from skillweave.skills.skill_set import SkillSet, within
-
-
-@dataclass(frozen=True)
-class UntrainedHierarchy:
-    """A placeholder for the policy of a skill that is a hierarchy and learns."""
-
-    skills: SkillSet
-    """The skills; the policies of those that learn are not used."""
-    selector: Policy | None
-    """The ready selector; None: it learns."""
-    guide: ActiveGuide | None = None
-    """A ready selector beside the learning one."""
-    goals: Goals | None = None
-    """The hierarchy's own goals, as a skill that has goals; None: it has none."""
-
-    @property
-    def action_space(self) -> gym.Space[Any]:
-        """The environment's."""
-        return self.skills.action_space
+from skillweave.skills.skill_set import SkillSet, UntrainedHierarchy, within
 
 
 def with_learners(

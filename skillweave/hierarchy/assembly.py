@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from skillweave._internal.policy_protocol import Policy
-from skillweave.experience.levels import UntrainedHierarchy
 from skillweave.hierarchy.fitting import learning_guide, restricting_guide
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.skills.goals import goals_of
 from skillweave.skills.own_part import OwnPart
-from skillweave.skills.skill_set import SkillSet
+from skillweave.skills.skill_set import SkillSet, UntrainedHierarchy
 
 
 def assembled(roles: Roles, policies: Mapping[str, Policy], path: str = "") -> HierarchyPolicy:

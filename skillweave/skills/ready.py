@@ -10,7 +10,7 @@ from typing import Any
 from gymnasium import Space
 
 from skillweave._internal.messages import short
-from skillweave._internal.policy_protocol import Policy
+from skillweave._internal.policy_protocol import Policy, is_policy
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.extensions import fetch_from, names_of
 from skillweave.policies.parts import GOAL
@@ -53,7 +53,7 @@ def as_policy(value: Any, where: str) -> Policy:
     refuse_skill(value, where)
     if isinstance(value, type):
         raise DeclarationError(f"{where} is the class {value.__name__}, not a policy")
-    if hasattr(value, "act") and hasattr(value, "start"):
+    if is_policy(value):
         policy: Policy = value
         return policy
     torch = sys.modules.get("torch")  # imported if the user has a module
@@ -62,7 +62,7 @@ def as_policy(value: Any, where: str) -> Policy:
     if callable(value):
         return from_function(value)
     own = getattr(value, "policy", None)
-    if hasattr(own, "act") and hasattr(own, "start"):  # of a run, or of a skill that is ready
+    if is_policy(own):  # of a run, or of a skill that is ready
         raise DeclarationError(
             f"{where} is {short(value)}, which has a policy, but is none: write its .policy"
         )

@@ -85,6 +85,25 @@ class SkillSet(LimitedCalls):
         return min(limits) if limits else None
 
 
+@dataclass(frozen=True)
+class UntrainedHierarchy:
+    """A placeholder for the policy of a skill that is a hierarchy and learns."""
+
+    skills: SkillSet
+    """The skills; the policies of those that learn are not used."""
+    selector: Any
+    """The ready selector; None: it learns."""
+    guide: ActiveGuide | None = None
+    """A ready selector beside the learning one."""
+    goals: Goals | None = None
+    """The hierarchy's own goals, as a skill that has goals; None: it has none."""
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """The environment's."""
+        return self.skills.action_space
+
+
 def skills_below(policy: Any) -> SkillSet | None:
     """Return the skills of a policy that is a hierarchy; None: it is none."""
     found = getattr(policy, "skills", None)
@@ -218,17 +237,16 @@ def policy_of(
     """
     if policy is None:
         return RowPolicy()
-    known = isinstance(policy, Functional) and policy.is_plain
-    if hasattr(policy, "act"):
-        inside = in_place(policy, who)
-        joins = not (known and policy.joins)
-        if isinstance(inside, Remembers) and not outermost:
-            inside = inside.policy
-        _check_memory(inside)
-    else:  # a hierarchy that learns
+    if isinstance(policy, UntrainedHierarchy):
         how = policy.skills, policy.selector, policy.guide, policy.goals
         inside = acting_policy(*how, outermost=outermost)
         joins = policy.goals is None
+    else:
+        inside = in_place(policy, who)
+        joins = isinstance(inside, Returns) or not getattr(policy, "joins", False)
+        if isinstance(inside, Remembers) and not outermost:
+            inside = inside.policy
+        _check_memory(inside)
     inside = Joined(inside) if joins and goals is not None else inside
     if part is None or part.correction is None:
         return inside

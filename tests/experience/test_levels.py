@@ -16,9 +16,8 @@ from toys import alone_in, calling_in
 
 from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.experience.levels import UntrainedHierarchy
 from skillweave.skills import Skill
-from skillweave.skills.skill_set import SkillSet
+from skillweave.skills.skill_set import SkillSet, UntrainedHierarchy
 
 N, ROWS, GAMMA, INNER = 4, 40, 0.97, 0.9
 
