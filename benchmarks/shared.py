@@ -1,11 +1,13 @@
 """Three skills of a half-cheetah, each from its own steps and from those of all three.
 
-    python -m benchmarks.shared [apart shared half] [--seeds 0 1]
+    python -m benchmarks.shared [apart shared half together alone] [--seeds 0 1]
 
-They run forward, run backward, and hold the nose up. ``apart``: 100k steps each. ``shared``: they
-are called by chance for 300k steps, and half of what each learns from are steps of the others.
-``half``: the same with 150k steps, and twice the gradient steps for each, so equally many. A score
-is the mean return of 100 calls, as a share of the way from no force (0) to ``apart`` (1).
+They run forward, run backward, and hold the nose up. ``apart``: 100k steps each. ``shared``: the
+same, but each also learns from the steps of those before it, which are half of each batch.
+``half``: the same with 50k steps each, and twice the gradient steps, so equally many. ``together``:
+they are called by chance for 300k steps, and half of each batch are steps of the others;
+``alone``: so, but each learns from its own steps. A score is the mean return of 100 calls, as a
+share of the way from no force (0) to ``apart`` (1).
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from skillweave.types import Array
 CALLS = 100
 PITCH, SPEED = 1, 8
 """Places of the observation: the angle of the body, and its speed forward."""
-KINDS = ("apart", "shared", "half")
+KINDS = ("apart", "shared", "half", "together", "alone")
 
 
 class Cheetah(Skill):
@@ -90,19 +92,18 @@ def returns(run: Any, seed: int) -> dict[str, float]:
 
 def trained(kind: str, seed: int) -> dict[str, Any]:
     """Train the skills in one way; return their mean returns, and minutes of processor."""
-    apart = kind == "apart"
     began = time.process_time()
     algorithm = SAC(
         network=Network((128, 128), "relu"),
         update_ratio=1.0 if kind == "half" else 0.5,
-        shared_replay=0.0 if apart else 0.5,
+        shared_replay=0.0 if kind in ("apart", "alone") else 0.5,
     )
     hierarchy = Hierarchy(
         EnvSpec("HalfCheetah-v5", workers=1),
         [Forward(), Back(), Stand()],
         algorithm=algorithm,
         selector=by_chance,
-        learn="apart" if apart else "together",
+        learn="together" if kind in ("together", "alone") else "apart",
         steps=150_000 if kind == "half" else 300_000,
     )
     with tempfile.TemporaryDirectory() as folder:
