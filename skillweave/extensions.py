@@ -13,7 +13,6 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
-from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, suggest
 from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, make_error
@@ -50,7 +49,6 @@ OPEN = ("function", "command", "reader", "section")
 """The kinds to which other packages add names."""
 
 
-@checked_names
 def fetch(name: str) -> Any:
     """Return a function of an extension, by its name.
 

@@ -50,14 +50,15 @@ def test_settings_are_copied_and_described_as_before(config):
     assert names == [f.name for f in dataclasses.fields(kind) if f.init]
 
 
-# Mathematics, types of results, and what only authors of algorithms call.
+# Mathematics, types of results, what only authors of algorithms call, and `fetch`: `--help` would
+# import NumPy for it.
 INSIDE = {
     "ActingParams", "ActionHead", "AgentState", "Algorithm", "Array", "Encoder", "Evaluation",
     "Export", "LastCall", "Layout", "Net", "OptionsEnv", "ParameterGroup",
     "ParentSelection", "Policy", "Report",
     "Blame", "CallEnds", "CallLog", "Chain", "Forecast", "Handover", "PlannedRun", "Reported",
     "Rollout", "Run", "Sample", "Seeds", "Skill", "SkillweaveError", "Step", "adam_",
-    "clip_grad_norm_", "gae", "mask_logits", "masked_mean", "normalize", "tree",
+    "clip_grad_norm_", "fetch", "gae", "mask_logits", "masked_mean", "normalize", "tree",
     *HOMES["skillweave.errors"],
 }  # fmt: skip
 CALLED = [(m, name) for m, homes in HOMES.items() for name in homes if name not in INSIDE]

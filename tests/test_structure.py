@@ -77,7 +77,7 @@ ROOMS: dict[str, set[str]] = {
     "named": {"errors", "messages"},
     "schema": {"errors", "messages", "arguments", "policies"},
     "_internal": set(),
-    "extensions": {"errors", "arguments", "messages", "notices"},
+    "extensions": {"errors", "messages", "notices"},
     "interrupts": {"terminal"},
     "ops": BASE,
     "spaces": BASE,
