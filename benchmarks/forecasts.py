@@ -27,7 +27,7 @@ import skillweave as sw
 from benchmarks.common import report, table
 from skillweave.envs.make import make_engine
 from skillweave.errors import RunError
-from skillweave.training.play import SeededEpisodes, play
+from skillweave.experience.play import SeededEpisodes, play
 from skillweave.types import Array, Step
 
 LOGS = (10_000, 30_000, 100_000)

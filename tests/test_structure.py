@@ -95,7 +95,8 @@ ROOMS: dict[str, set[str]] = {
     "hierarchy": LEARNING | {"training"},
     "evolution": LEARNING | {"training"},
     "export": LEARNING | {"training", "hierarchy"},
-    "reporting": BASE | {"spaces", "skills", "envs", "runs", "calls", "training", "hierarchy"},
+    "reporting": BASE
+    | {"spaces", "skills", "envs", "runs", "experience", "calls", "training", "hierarchy"},
     "shipped": {"errors"},
     "api": CENTRE | {"shipped"},
     "types": {"public", "policies", "policy_protocol", "training", "hierarchy", "export"},

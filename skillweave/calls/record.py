@@ -19,9 +19,9 @@ from skillweave._internal.seeding import Seeds, global_generators
 from skillweave.calls.log import CallLog
 from skillweave.calls.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
 from skillweave.envs.engine import Engine, GymnasiumEngine, episode_seed
-from skillweave.envs.env_infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError, Interrupted
+from skillweave.experience.play import EngineEpisodes, PlayedStep, play
 from skillweave.extensions import fetch
 from skillweave.policies.core import (
     Around,
@@ -30,8 +30,6 @@ from skillweave.policies.core import (
     Memory as InPlaceMemory,
     RowPolicy,
     Turn,
-    World,
-    restart,
 )
 from skillweave.policies.parts import GOAL
 from skillweave.schema import AtLeastOne, fitted
@@ -171,20 +169,20 @@ def with_returns(
             skill_set, spaces, num_envs, info=info, own_rewards=own_rewards, spec=spec
         )
         policy = acting_policy(skill_set, selector)
-        turn = Turn(World((seeds / "choices").numpy()), greedy=not isinstance(choose, RandomChoice))
-        played: list[int] = []
+        rng = (seeds / "choices").numpy()
+        episodes = RecordedEpisodes(engine, steps, seeds.integer())
         # Without `keep` an interrupt may be one of the training around.
         until, stops = (nullcontext(), bool) if keep is None else (deferred("now"), requested)
         stopped = False
         try:
             with until:
-                _play(recorder, engine, policy, steps, turn, seeds.integer(), choose, played, stops)
+                _record(recorder, episodes, policy, choose, rng, stops)
         except KeyboardInterrupt:
             if keep is None:
                 raise
             stopped = True
         log = recorder.log()
-        log = replace(log, seed=np.array(played)[log.episode])
+        log = replace(log, seed=np.array(episodes.seeds)[log.episode])
         if keep is not None and len(log):
             keep(log)
         if stopped:
@@ -260,68 +258,77 @@ def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
     )
 
 
-def _play(
-    recorder: Recorder,
-    engine: Engine,
-    policy: RowPolicy,
-    steps: int,
-    turn: Turn,
-    seed: int,
-    choose: Any,
-    seeds: list[int],
-    stops: Callable[[], bool],
-) -> None:
-    """Play until ``steps`` steps are recorded, then complete the open calls.
+class RecordedEpisodes(EngineEpisodes):
+    """Episodes until enough steps are made, and then until the open calls are over.
 
     Args:
-        seeds: receives the seeds of episodes as they start; −1: unknown, of EnvPool.
+        steps: enough of them.
+        seed: of all episodes.
+    """
+
+    def __init__(self, engine: Engine, steps: int, seed: int) -> None:
+        super().__init__(engine)
+        self.seeds: list[int] = []
+        """Those of episodes as they start; −1: unknown, of EnvPool."""
+        self.steps = steps
+        self._made = 0
+        self._seed = seed
+        self._started = np.zeros(self.num_envs, np.int64)  # episodes of each environment
+        self.obs = np.array(self._begin(self.rows))
+
+    def advance(self, played: PlayedStep) -> Array:
+        """Start episodes where others are over; return these environments (m,)."""
+        self._made += len(played.rows)
+        over = played.rows[played.over]
+        if len(over):
+            self.obs[over] = self._begin(over)
+            self.elapsed[over] = 0
+        if self._made >= self.steps:
+            self.rows = self.rows[played.memory["end"][self.rows] == CallEnd.RUNNING]
+        return over
+
+    def _begin(self, rows: Array) -> Array:
+        """Begin episodes in environments ``rows``; return observations."""
+        each = [episode_seed(self._seed, i, int(self._started[i])) for i in rows.tolist()]
+        fresh = not self._started.any()
+        self._started[rows] += 1
+        if isinstance(self.engine, GymnasiumEngine):
+            self.seeds += each
+            return self.engine.reset_some(rows, each)
+        self.seeds += [-1] * len(rows)
+        return self.engine.reset(self._seed) if fresh else self.engine.reset_some(rows)
+
+
+def _record(
+    recorder: Recorder,
+    episodes: RecordedEpisodes,
+    policy: RowPolicy,
+    choose: Any,
+    rng: np.random.Generator,
+    stops: Callable[[], bool],
+) -> None:
+    """Record the calls of a policy in episodes.
+
+    Args:
+        choose: its selector; one that learns meanwhile does so.
+        rng: of all that is sampled.
         stops: returns whether to stop at once.
     """
-    n = engine.num_envs
     feed = TraceFeed([recorder])
     goals = goals_in(recorder.skills)
-    started = np.zeros(n, np.int64)  # episodes of each environment
-
-    def begin(rows: Array) -> Array:
-        """Begin episodes in environments ``rows``; return observations."""
-        each = [episode_seed(seed, i, int(started[i])) for i in rows.tolist()]
-        fresh = not started.any()
-        started[rows] += 1
-        if isinstance(engine, GymnasiumEngine):
-            seeds.extend(each)
-            return engine.reset_some(rows, each)
-        seeds.extend([-1] * len(rows))
-        return engine.reset(seed) if fresh else engine.reset_some(rows)
-
-    memory = policy.start(n)
-    obs = np.array(begin(np.arange(n)))
-    turn.world.age = age = np.zeros(n, np.int64)
-    rows = np.arange(n)
-    made = 0
-    planned = 0
+    greedy = not isinstance(choose, RandomChoice)
+    made = learnt = 0
     try:
-        while len(rows) and not stops():
-            here = obs[rows]
-            turn.mask = allowed_rows(engine.mask(), rows)
-            action = policy.act(memory, rows, here, turn)
-            raw = engine.step(action, rows)
-            age[rows] += 1
-            step = raw.seen(here, action, age[rows])
-            policy.observe(memory, rows, step)
-            feed.add(rows, step, {"": calls_in(memory, goals, rows)})
-            made += len(rows)
-            obs[rows] = raw.next_obs
-            over = rows[raw.terminated | raw.truncated]
-            if len(over):
-                obs[over] = begin(over)
-                restart(policy, memory, over)
-                age[over] = 0
-            if made >= steps:
-                rows = rows[memory["end"][rows] == CallEnd.RUNNING]
-            elif isinstance(choose, LearnsWhileRecording) and made - planned >= choose.every:
-                planned = made
+        for played in play(policy, episodes, deterministic=greedy, rng=rng):
+            feed.add(played.rows, played.step, {"": calls_in(played.memory, goals, played.rows)})
+            made += len(played.rows)
+            learns = isinstance(choose, LearnsWhileRecording) and made < episodes.steps
+            if learns and made - learnt >= choose.every:
+                learnt = made
                 feed.flush()
                 if recorder.calls:
                     choose.learn(recorder.log())
+            if stops():
+                break
     finally:
         feed.flush()

@@ -15,6 +15,7 @@ from skillweave.calls.columns import ENDS
 from skillweave.calls.handover import wilson
 from skillweave.calls.run_log import load_calls
 from skillweave.envs.make import EnvSpec
+from skillweave.experience.play import PlayedStep as PlayedStep
 from skillweave.html_report import charts
 from skillweave.html_report.film import episode_shot, make_film
 from skillweave.html_report.goal_maps import goal_pictures
@@ -57,7 +58,6 @@ from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
-from skillweave.training.play import PlayedStep as PlayedStep
 from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 from skillweave.training.skill_report import levels_of, skill_rows
 

@@ -21,13 +21,13 @@ from skillweave.envs.checked import LONG_EPISODE
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
+from skillweave.experience.play import PlayedStep, SeededEpisodes, play
 from skillweave.policies.core import Array
 from skillweave.reporting.palette import BAND, BLACK, LINE, RGB, WHITE, is_light
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.schema import AtLeastOne, Count, fitted
-from skillweave.training.play import PlayedStep, SeededEpisodes, play
 
 MAX_WIDTH = 960  # pixels; larger frames are reduced
 MIN_WIDTH = 240  # pixels; smaller frames are enlarged

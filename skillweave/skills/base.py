@@ -109,8 +109,8 @@ class Skill:
             ``Hierarchy.rest`` says. None: all of it. Its methods see all, with or without these.
         policy: acts without training: a function of observations (n, *obs_shape), which needs no
             ``staticmethod``, or a method ``policy(self, obs)``, with a goal ``policy(self, obs,
-            goal)``; a torch module;
-            ``from_sb3(...)``, ``from_onnx(...)``, or the path of an ONNX file; any ``Policy``. None: it is trained; so is a
+            goal)``; a torch module; ``from_sb3(...)``, ``from_onnx(...)``, or the path of an ONNX
+            file; any ``Policy``. None: it is trained; so is a
             ``Residual`` of such a policy, and one with ``learn=True``. Where an
             environment has an action mask, networks that return logits respect it; actions of
             others go to the environment unchanged.

@@ -27,6 +27,7 @@ from skillweave.envs.env_infos import notice_odd_success, reported_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.envs.pool import POOL_SEEDS
 from skillweave.errors import DeclarationError, SkillweaveError
+from skillweave.experience.play import PlayedStep, SeededEpisodes, play
 from skillweave.policies.core import Array
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.schema import UNSAVED, AtLeastOne, Count, fitted
@@ -35,7 +36,6 @@ from skillweave.skills.foreign_policy import Foreign, check_spaces
 from skillweave.skills.goals import goals_of
 from skillweave.skills.ready import as_policy
 from skillweave.skills.skill_set import skills_below
-from skillweave.training.play import PlayedStep, SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.training.skill_report import (
     TITLES,

@@ -15,6 +15,7 @@ from skillweave.calls.columns import GOAL, OF_CALL
 from skillweave.calls.log import CallLog
 from skillweave.calls.recorder import SUMS, Recorder, TraceFeed, calls_in, goals_in, levels_below
 from skillweave.envs.make import EnvSpec
+from skillweave.experience.play import PlayedStep
 from skillweave.experience.views import seen_by, stops
 from skillweave.policies.core import EPISODE, LIMIT, OWN, RUNNING, Array, end_with_episode
 from skillweave.policies.parts import OWN_GOAL
@@ -22,7 +23,6 @@ from skillweave.skills import Reflex, Skill, call_method
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.skill_set import SkillSet, skills_below
-from skillweave.training.play import PlayedStep
 
 WAITS, IS_DONE = -1, -2
 """In place of the steps of the call of a skill that acts alone."""

@@ -24,6 +24,7 @@ from skillweave._internal.seeding import Seeds
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.experience.acting import Acted, Request
 from skillweave.experience.collector import Collector
+from skillweave.experience.play import SeededEpisodes, play
 from skillweave.export import compile
 from skillweave.export.graphs import examples, mask_width
 from skillweave.export.runner import Runner
@@ -34,7 +35,6 @@ from skillweave.policies.core import Memory, Turn, World as Acting, flat, restar
 from skillweave.policies.spaces import space_of
 from skillweave.skills import Skill
 from skillweave.spaces import ChoiceSpace, pack
-from skillweave.training.play import SeededEpisodes, play
 from skillweave.types import Array, Step
 
 N, SEED = 3, 5

@@ -1,4 +1,4 @@
-"""The loop that plays whole episodes, for evaluation, periodic evaluation and videos."""
+"""The loop that plays episodes: for evaluations, films, and logs of calls."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from skillweave.envs.env_infos import allowed_rows
 from skillweave.policies.core import (
     Array,
     Memory as InPlaceMemory,
+    RowPolicy,
     Step,
     Turn,
     World,
     flat,
-    put,
+    restart,
     split,
-    take,
 )
 from skillweave.skills.skill_set import in_place
 
@@ -48,8 +48,8 @@ class PlayedStep:
 
 
 def play(
-    policy: Policy,
-    episodes: SeededEpisodes,
+    policy: Policy | RowPolicy,
+    episodes: EngineEpisodes,
     *,
     deterministic: bool = True,
     rng: np.random.Generator | None = None,
@@ -59,6 +59,7 @@ def play(
     """Play all episodes, a step at a time.
 
     Args:
+        policy: of any form; one that acts in place is of no skills.
         deterministic: act greedily, else sample with ``rng``.
         before_step: called with the policy's memory, of all environments, after it has chosen an
             action, before the environments step.
@@ -66,7 +67,7 @@ def play(
     """
     n = episodes.num_envs
     acts = in_place(policy)
-    world = World(rng)
+    world = World(rng, episodes.elapsed)
     memory = acts.start(n)
     choose_goals = getattr(policy, "choose_goals", None)
     shown = split(flat(memory))  # the same arrays
@@ -84,7 +85,10 @@ def play(
         action = acts.act(memory, rows, episodes.obs[rows], turn)
         if before_step is not None:
             before_step(memory)
-        acting = policy.acting({k: v[rows] for k, v in memory.items() if not isinstance(v, dict)})
+        acting = None
+        if not isinstance(policy, RowPolicy):
+            own = {k: v[rows] for k, v in memory.items() if not isinstance(v, dict)}
+            acting = policy.acting(own)
         before = memory["elapsed"][rows] if "elapsed" in memory else np.ones(len(rows))
         played = episodes.step(action)
         acts.observe(memory, rows, played.step)
@@ -94,11 +98,49 @@ def play(
         yield played
         restarted = episodes.advance(played)
         if len(restarted):
-            put(memory, restarted, take(acts.start(n), restarted))
+            restart(acts, memory, restarted)
             begin(restarted)
 
 
-class SeededEpisodes:
+class EngineEpisodes:
+    """EngineEpisodes in an engine, which a subclass starts.
+
+    Args:
+        max_steps: an episode without an end by then is cut; None: none is.
+    """
+
+    def __init__(self, engine: Engine, max_steps: int | None = None) -> None:
+        self.engine = engine
+        self.num_envs = engine.num_envs
+        self.rows = np.arange(self.num_envs)
+        """(k,) acting environments; empty: all episodes are over."""
+        self.episode = np.arange(self.num_envs)
+        """(N,) the numbers of their episodes."""
+        self.elapsed = np.zeros(self.num_envs, np.int64)
+        """(N,) steps of their episodes; the same array all the time."""
+        self.obs: Array = np.zeros(0)
+        """(N, *obs_shape), the next observations."""
+        self._max_steps = np.inf if max_steps is None else max_steps
+
+    def step(self, action: Array) -> PlayedStep:
+        """Step the environments of the episodes in ``rows``."""
+        rows = self.rows
+        obs = self.obs[rows]
+        raw = self.engine.step(action, rows)
+        self.elapsed[rows] += 1
+        self.obs[rows] = raw.next_obs
+        elapsed = self.elapsed[rows]
+        step = raw.seen(obs, action, elapsed)
+        cut = ~(raw.terminated | raw.truncated) & (elapsed >= self._max_steps)
+        one = np.ones(len(rows), np.int64)
+        return PlayedStep(rows, self.episode[rows], step, raw.reward, one, cut)
+
+    def advance(self, played: PlayedStep) -> Array:
+        """Start episodes where others are over; return these environments (m,)."""
+        raise NotImplementedError
+
+
+class SeededEpisodes(EngineEpisodes):
     """Whole episodes in an engine.
 
     Args:
@@ -108,15 +150,8 @@ class SeededEpisodes:
     """
 
     def __init__(self, engine: Engine, seeds: Sequence[int] | int, max_steps: int) -> None:
-        self.engine = engine
-        self.num_envs = engine.num_envs
-        self.rows = np.arange(self.num_envs)
-        """(k,) acting environments; empty: all episodes are over."""
+        super().__init__(engine, max_steps)
         self._seeds = [] if isinstance(seeds, int) else seeds
-        self._max_steps = max_steps
-        self.episode = np.arange(self.num_envs)
-        """(N,) the numbers of their episodes."""
-        self._elapsed = np.zeros(self.num_envs, np.int64)
         if isinstance(seeds, int):
             self._upcoming = 0
             first = engine.reset(seeds)
@@ -125,20 +160,6 @@ class SeededEpisodes:
             self._upcoming = len(self.rows)
             first = engine.reset_some(self.rows, list(seeds[: self._upcoming]))
         self.obs = np.array(first)
-        """(N, *obs_shape), the next observations."""
-
-    def step(self, action: Array) -> PlayedStep:
-        """Step the environments of the episodes in ``rows``."""
-        rows = self.rows
-        obs = self.obs[rows]
-        raw = self.engine.step(action, rows)
-        self._elapsed[rows] += 1
-        self.obs[rows] = raw.next_obs
-        elapsed = self._elapsed[rows]
-        step = raw.seen(obs, action, elapsed)
-        cut = ~(raw.terminated | raw.truncated) & (elapsed >= self._max_steps)
-        one = np.ones(len(rows), np.int64)
-        return PlayedStep(rows, self.episode[rows], step, raw.reward, one, cut)
 
     def advance(self, played: PlayedStep) -> Array:
         """Start remaining episodes where others are over; return these environments (m,)."""
@@ -152,5 +173,5 @@ class SeededEpisodes:
             seeds = self._seeds[first : self._upcoming]
             self.obs[restarted] = self.engine.reset_some(restarted, seeds)
             self.episode[restarted] = np.arange(first, self._upcoming)
-            self._elapsed[restarted] = 0
+            self.elapsed[restarted] = 0
         return restarted
