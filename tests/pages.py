@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from skillweave import Agent, Hierarchy
+from skillweave import Agent, Hierarchy, api
 
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```python\n(.*?)^```", flags=re.S | re.M)
@@ -58,7 +58,7 @@ def _shorter(group: Any) -> Any:
 
 def train_briefly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut the budgets of everything that is trained, and keep it quiet."""
-    train, train_alone = Hierarchy.train, Agent.train
+    train, train_alone, trains_alone = Hierarchy.train, Agent.train, api.train_agent
 
     def hierarchy(self: Hierarchy, *args: Any, **kwargs: Any) -> Any:
         self.steps = min(self.steps or STEPS, STEPS)
@@ -77,5 +77,10 @@ def train_briefly(monkeypatch: pytest.MonkeyPatch) -> None:
             kwargs["evolve"] = _smaller(kwargs["evolve"])
         return train_alone(self, *args, **kwargs | {"quiet": True})
 
+    def function(env: Any, algorithm: Any, steps: int, *args: Any, **kwargs: Any) -> Any:
+        how = kwargs | {"quiet": True}
+        return trains_alone(env, _sooner(algorithm), min(steps, STEPS), *args, **how)
+
     monkeypatch.setattr(Hierarchy, "train", hierarchy)
     monkeypatch.setattr(Agent, "train", agent)
+    monkeypatch.setattr(api, "train_agent", function)
