@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from typing import Any
 
 from skillweave._internal.messages import short, suggest
@@ -19,7 +20,7 @@ from skillweave.errors import DeclarationError, make_error
 
 GROUP = "skillweave.extensions"
 """The group of entry points by which other packages add names."""
-OWN: Mapping[str, Mapping[str, str]] = {
+SHIPPED: Mapping[str, Mapping[str, str]] = {
     "function": {
         "explore": "skillweave.planning.explorer:Explorer",
         "plan": "skillweave.planning.planned_run:plan",
@@ -70,15 +71,15 @@ def fetch_from(kind: str, name: str) -> Any:
         raise DeclarationError(
             f"no installed extension has the {kind} {short(name)}{suggest(name, names)}"
         )
-    return load(names[name], name)
+    return resolve(names[name], name)
 
 
 def names_of(kind: str) -> dict[str, str]:
     """Return the names of a kind, each with ``module:attribute``: the own ones come first."""
-    return dict(OWN[kind]) | _of_others().get(kind, {})
+    return dict(SHIPPED[kind]) | _of_others().get(kind, {})
 
 
-def load(place: str, name: str = "") -> Any:
+def resolve(place: str, name: str = "") -> Any:
     """Return what ``module:attribute`` is.
 
     Args:
@@ -92,12 +93,12 @@ def load(place: str, name: str = "") -> Any:
     try:
         return getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
-        parts = str(error.name).split(".")
-        if parts[0] != "skillweave":
-            raise  # what an extension needs names its extra itself
+        extension = ".".join(str(error.name).split(".")[:2])
+        if not extension.startswith("skillweave.") or find_spec(extension) is not None:
+            raise  # another package, or a mistake in the extension
         raise make_error(
             "MissingExtra",
-            f"{name or module!r} needs {'.'.join(parts[:2])}, which is not installed here: install "
+            f"{name or module!r} needs {extension}, which is not installed here: install "
             "Skillweave whole, pip install --force-reinstall skillweave",
         ) from error
 
@@ -114,7 +115,7 @@ def _of_others() -> dict[str, dict[str, str]]:
                 f"{package} adds the extension {short(point.name)}, whose kind is unknown; it must "
                 f"be one of {', '.join(f'{k}.NAME' for k in OPEN)}, so it is left out"
             )
-        elif name in OWN[kind] or name in found[kind]:
+        elif name in SHIPPED[kind] or name in found[kind]:
             notice(f"{package} adds the {kind} {name!r}, which is there already: it is left out")
         else:
             found[kind][name] = point.value

@@ -15,6 +15,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # here, in each worker, and in wh
 import pytest
 import torch
 from hypothesis import settings
+from installed import EXTENSIONS
 
 torch.set_num_threads(1)
 os.fsync = lambda _: None  # no test cuts the power, so nothing need reach the disk
@@ -29,9 +30,6 @@ if importlib.util.find_spec("jaxtyping") and importlib.util.find_spec("beartype"
 
     # Before anything else imports these: `from … import gae` then finds what is checked.
     check_shapes("returns", "losses", "distributions", "optim")
-
-
-EXTENSIONS = ("planning", "html_report", "repair", "recipes", "demo", "compat")
 
 
 def is_missing(extension: str) -> bool:

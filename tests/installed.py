@@ -6,5 +6,15 @@ from importlib.util import find_spec
 
 from skillweave._internal import public
 
+EXTENSIONS: dict[str, set[str]] = {
+    "planning": set(),
+    "html_report": set(),
+    "repair": set(),
+    "recipes": set(),
+    "demo": {"recipes"},
+    "compat": set(),
+}
+"""What each extension may import beside the core: the extensions that it stands on."""
+
 HOMES = {module: homes for module, homes in public.HOMES.items() if find_spec(module)}
 """By module that users import from: its names, each with the module that defines it."""

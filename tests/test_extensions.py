@@ -11,7 +11,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from test_structure import EXTENSIONS, ROOT
+from installed import EXTENSIONS
+from test_structure import ROOT
 
 import skillweave as sw
 from skillweave import extensions
@@ -63,7 +64,7 @@ import skillweave as sw
 from importlib import import_module
 from pathlib import Path
 from skillweave.cli import main
-from skillweave.extensions import OWN, fetch_from, load
+from skillweave.extensions import SHIPPED, fetch_from, resolve
 from skillweave.errors import MissingExtra
 
 root = Path(sw.__file__).parent
@@ -72,12 +73,12 @@ for path in sorted(root.rglob("*.py")):
     if parts[0] not in {extensions!r} and parts[-1] not in ("__main__", "runner"):
         import_module(".".join(["skillweave", *(p for p in parts if p != "__init__")]))
 lacks = []
-for kind, names in OWN.items():
+for kind, names in SHIPPED.items():
     for name in names:
         try:
             found = fetch_from(kind, name)
             if kind == "command":
-                load(found[1])
+                resolve(found[1])
         except MissingExtra as error:
             assert "skillweave." in str(error), error
             lacks.append(f"{{kind}}.{{name}}")
@@ -108,8 +109,11 @@ def test_the_core_works_without_an_extension_and_says_what_is_missing(
 def test_a_name_that_no_extension_has_is_refused() -> None:
     with pytest.raises(DeclarationError, match=r"'plam'.*plan"):
         extensions.fetch("plam")
+    with pytest.raises(ModuleNotFoundError, match="no_such") as raised:
+        extensions.resolve("skillweave.planning.no_such:f", "x")
+    assert not isinstance(raised.value, MissingExtra), "its room is there"
     with pytest.raises(MissingExtra, match=r"'x' needs skillweave\.nowhere"):
-        extensions.load("skillweave.nowhere.there:f", "x")
+        extensions.resolve("skillweave.nowhere.there:f", "x")
 
 
 # A package of somebody else: the one of the page

@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from installed import HOMES
+from installed import EXTENSIONS, HOMES
 
 from skillweave._internal.public import ALSO
 
@@ -46,15 +46,6 @@ LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "al
 LEARNING |= {"experience", "workers", "calls"}
 CENTRE = LEARNING | {"training", "hierarchy", "evolution", "reporting", "export"}
 CORE = CENTRE | {"shipped", "api", "cli", "skillweave"}
-# What each extension may import beside the core: the extensions that it stands on.
-EXTENSIONS: dict[str, set[str]] = {
-    "planning": set(),
-    "html_report": set(),
-    "repair": set(),
-    "recipes": set(),
-    "demo": {"recipes"},
-    "compat": set(),
-}
 # The only imports of an extension by the core: in annotations, what methods of ``Run`` return.
 RETURNED = {("api", "planning.planned_run"), ("api", "repair.repair_stage")}
 ROOMS: dict[str, set[str]] = {

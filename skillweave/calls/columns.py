@@ -15,6 +15,7 @@ import numpy as np
 
 from skillweave._internal.messages import shortened, suggest
 from skillweave.algorithms.batches import INFO
+from skillweave.calls.neighbors import Standard
 from skillweave.errors import DeclarationError
 from skillweave.policies.core import Array, CallEnd, Choices, Step
 from skillweave.runs.user_code import Texts
@@ -168,6 +169,17 @@ class CallColumns(Choices):
     def began_late(self) -> Array:
         """(C,) bool: the call began too late to run its whole length, so it counts nowhere."""
         return began_late(self.age, self.whole_steps[self.choice], self.time_limit)
+
+    @cached_property
+    def change_rate(self) -> Array:
+        """The share of steps in which each number of the flat observation changes, (F,)."""
+        share: Array = (self.flat(self.before) != self.flat(self.next_obs)).mean(0)
+        return share
+
+    @cached_property
+    def varies(self) -> Array:
+        """(F,) bool: the number of the flat observation is not the same in all steps."""
+        return Standard(self.flat(self.before)).varies
 
     @cached_property
     def followed_by(self) -> Array:

@@ -35,9 +35,7 @@ def fixed_places(log: CallColumns) -> list[int]:
     """
     if _sees_images(log):
         return []
-    before = log.flat(log.before)
-    still = (before == log.flat(log.next_obs)).all(0)
-    return np.flatnonzero(still & Standard(before).varies).tolist()
+    return np.flatnonzero((log.change_rate == 0) & log.varies).tolist()
 
 
 def compared_places(log: CallColumns, *, keep_fixed: bool = False) -> tuple[Places, ...]:
@@ -55,13 +53,10 @@ def compared_places(log: CallColumns, *, keep_fixed: bool = False) -> tuple[Plac
     if _sees_images(log):
         return tuple(log.sees)
     codec = obs_codec(log.observation_space)
-    before, after = log.flat(log.before), log.flat(log.next_obs)
-    changes = (before != after).mean(0)
-    varies = Standard(before).varies
-    fixed = [] if keep_fixed else np.flatnonzero((changes == 0) & varies).tolist()
-    moves = np.flatnonzero(changes > MOST_STEPS).tolist()
-    start = before[log.offset[:-1]]
-    end = after[log.offset[1:] - 1]
+    fixed = [] if keep_fixed else fixed_places(log)
+    moves = np.flatnonzero(log.change_rate > MOST_STEPS).tolist()
+    start = log.flat(log.start)
+    end = log.flat(log.end)
     places: list[Places] = []
     for skill, seen in enumerate(log.sees):
         if seen is None and codec.images:
@@ -69,7 +64,7 @@ def compared_places(log: CallColumns, *, keep_fixed: bool = False) -> tuple[Plac
             continue
         whole = range(codec.size) if seen is None else sorted({*seen, *moves})
         doubtful = [place for place in whole if place in fixed]
-        rest = [place for place in whole if place not in fixed and varies[place]]
+        rest = [place for place in whole if place not in fixed and log.varies[place]]
         if doubtful and rest and not _help(log, skill, start, end, rest, doubtful):
             places.append([place for place in whole if place not in fixed])
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import replace
@@ -57,21 +56,20 @@ class RandomChoice(RowPolicy):
         return np.asarray(best.argmax(1))
 
 
-class LearnsWhileRecording(RowPolicy):
+class RecordingSelector(RowPolicy):
     """A selector for ``record_calls`` that learns from the calls so far."""
 
     every: int
     """The steps after which it learns again."""
 
-    @abstractmethod
     def begin(self, choices: int) -> None:
         """Prepare for a recording; ``choices``: of a selector, skills times lengths."""
+        raise NotImplementedError
 
-    @abstractmethod
     def learn(self, log: CallLog) -> None:
         """Learn from the calls so far."""
+        raise NotImplementedError
 
-    @abstractmethod
     def decide(
         self, obs: Array, mask: Array | None, rng: np.random.Generator
     ) -> tuple[Array, dict[str, tuple[Array, Array]]]:
@@ -84,6 +82,7 @@ class LearnsWhileRecording(RowPolicy):
             Choices, and by skill with goals the rows (k,) with the numbers of their goals (k, G).
             All other calls are new, and need new goals.
         """
+        raise NotImplementedError
 
     def act(self, memory: InPlaceMemory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return choices (k,)."""
@@ -215,7 +214,7 @@ class WithDrawnGoals(Around):
         rng = turn.world.rng
         again = dict[str, tuple[Array, Array]]()
         assert rng is not None
-        if isinstance(self._selector, LearnsWhileRecording):
+        if isinstance(self._selector, RecordingSelector):
             number, again = self._selector.decide(obs, turn.mask, rng)
         else:
             number = super().act(memory, rows, obs, turn)
@@ -235,7 +234,7 @@ def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
     """Return the acting selector that ``choose`` means, for the skills in an engine."""
     names = tuple(s.name for s in skills.skills)
     choices = skills.choice_space
-    if isinstance(choose, LearnsWhileRecording):
+    if isinstance(choose, RecordingSelector):
         choose.begin(skills.choices)
     if isinstance(choose, RowPolicy):
         return WithDrawnGoals(choose, skills, choices) if goals_in(skills) else choose
@@ -322,7 +321,7 @@ def _record(
         for played in play(policy, episodes, deterministic=greedy, rng=rng):
             feed.add(played.rows, played.step, {"": calls_in(played.memory, goals, played.rows)})
             made += len(played.rows)
-            learns = isinstance(choose, LearnsWhileRecording) and made < episodes.steps
+            learns = isinstance(choose, RecordingSelector) and made < episodes.steps
             if learns and made - learnt >= choose.every:
                 learnt = made
                 feed.flush()

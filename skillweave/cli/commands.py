@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -290,7 +291,7 @@ class PullCommand(Output):
 
 CommandEntry = tuple[type[Output], str]
 """A command, and "module:function", which is given it and returns its ``Result``."""
-OWN: tuple[CommandEntry, ...] = (
+OF_CORE: tuple[CommandEntry, ...] = (
     (TrainCommand, "skillweave.cli.training_commands:train"),
     (ResumeCommand, "skillweave.cli.training_commands:resume"),
     (SweepCommand, "skillweave.cli.sweep:sweep"),
@@ -313,9 +314,10 @@ def name_of(command: type) -> str:
     return re.sub(r"(?<!^)(?=[A-Z])", "-", command.__name__.removesuffix("Command")).lower()
 
 
+@cache
 def all_commands() -> dict[str, CommandEntry]:
     """Return the commands of the core and of the extensions that are installed, by name."""
-    entries = {name_of(entry[0]): entry for entry in OWN}
+    entries = {name_of(entry[0]): entry for entry in OF_CORE}
     for name in names_of("command"):
         try:
             entries[name] = fetch_from("command", name)

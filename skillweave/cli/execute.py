@@ -25,7 +25,7 @@ from skillweave.cli.output import Result, run_words, save_score
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.targets import lacking_words, load_target, load_with_code
 from skillweave.errors import DeclarationError, RunError
-from skillweave.extensions import load
+from skillweave.extensions import resolve
 from skillweave.hierarchy.recorded import calls_of
 from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
@@ -43,8 +43,8 @@ def run(command: commands.Output) -> Result:
         for word in value if isinstance(value, tuple) else (value,):
             if isinstance(word, Path) or (word and field.name in ("recipe", "target")):
                 as_path(word, field.name)
-    by_kind = dict(commands.all_commands().values())
-    way: Callable[[Any], Result] = load(by_kind[type(command)])
+    ways = dict(commands.all_commands().values())
+    way: Callable[[Any], Result] = resolve(ways[type(command)])
     return way(command)
 
 

@@ -10,7 +10,7 @@ from skillweave._internal.messages import error_text, short
 from skillweave._internal.policy_protocol import Policy
 from skillweave.calls.log import CallLog
 from skillweave.envs.make import EnvSpec
-from skillweave.extensions import load, names_of
+from skillweave.extensions import names_of, resolve
 from skillweave.html_report.page import Page
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import Evaluation
@@ -52,7 +52,7 @@ def add_sections(page: Page, about: Reported) -> None:
     page.context["more"] = []
     for name, place in names_of("section").items():
         try:
-            make: MakeSection = load(place)
+            make: MakeSection = resolve(place)
             section = make(about)
             if not isinstance(section, Section | None):
                 raise TypeError(f"it must return a Section or None, not {short(section)}")

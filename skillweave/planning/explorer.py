@@ -9,7 +9,7 @@ import numpy as np
 from skillweave._internal.arguments import checked_names
 from skillweave.calls.log import CallLog
 from skillweave.calls.neighbors import check_features
-from skillweave.calls.record import LearnsWhileRecording
+from skillweave.calls.record import RecordingSelector
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
 from skillweave.policies.core import Array
@@ -21,7 +21,7 @@ _Temperature = Annotated[float, Check("from 1e-06 to 10", lambda x: 1e-6 <= x <=
 
 
 @checked_names
-class Explorer(LearnsWhileRecording):
+class Explorer(RecordingSelector):
     """A selector for ``record_calls`` that prefers calls which differ from the logged ones.
 
     Where the nearest logged call of a skill is further than ``radius``, calling it is worth the

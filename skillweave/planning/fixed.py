@@ -8,7 +8,7 @@ import numpy as np
 
 from skillweave.calls.columns import CallColumns
 from skillweave.calls.compared import FEWEST, MOST, fixed_places, predict_better
-from skillweave.calls.neighbors import Standard, evenly
+from skillweave.calls.neighbors import evenly
 from skillweave.planning.lacking import read_log
 from skillweave.planning.machine import RewardMachine
 from skillweave.spaces import leaves
@@ -60,8 +60,7 @@ def _pays_by(task: RewardMachine, log: CallColumns, fixed: list[int]) -> bool:
     Raises:
         RunError: see ``read_log``.
     """
-    varies = np.flatnonzero(Standard(log.flat(log.before)).varies).tolist()
-    rest = [place for place in varies if place not in fixed]
+    rest = [place for place in np.flatnonzero(log.varies).tolist() if place not in fixed]
     if not rest or not (task.rewards or any(event.reads != "obs" for event in task.events)):
         return False
     known = read_log(task, log)

@@ -11,7 +11,7 @@ from gymnasium import Space
 
 from skillweave._internal.messages import short
 from skillweave._internal.policy_protocol import Policy, is_policy
-from skillweave.errors import DeclarationError, PolicyError
+from skillweave.errors import DeclarationError, PolicyError, SkillweaveError, reworded
 from skillweave.extensions import fetch_from, names_of
 from skillweave.policies.parts import GOAL
 from skillweave.skills.base import Skill, is_trained
@@ -31,6 +31,8 @@ def ready_policy(skill: Skill) -> Policy | None:
     Raises:
         DeclarationError: the attribute ``policy`` cannot act.
     """
+    if isinstance(skill.policy, str | Path):
+        skill.policy = _as_policy(skill.policy, skill)  # so that the file is read once
     return None if is_trained(skill) else _as_policy(skill.policy, skill)
 
 
@@ -75,11 +77,23 @@ def as_policy(value: Any, where: str) -> Policy:
     elif isinstance(value, str | Path):
         suffix = Path(value).suffix
         if suffix[1:] in names_of("reader"):
-            read: Policy = fetch_from("reader", suffix[1:])(value)
-            return read
+            return _read(value, suffix[1:], where)
         if make := FILES.get(suffix):
             advice = f"a file acts by {make.format(str(value))}"
     raise DeclarationError(f"{where} is {short(value)}, which cannot act; {advice}")
+
+
+def _read(path: str | Path, kind: str, where: str) -> Policy:
+    """Return the policy in a file, by the reader of its ``kind``.
+
+    Raises:
+        SkillweaveError: the file is missing or wrong; ``where`` begins the message.
+    """
+    try:
+        policy: Policy = fetch_from("reader", kind)(path)
+    except SkillweaveError as error:
+        raise reworded(error, f"{where}: {error}") from error
+    return policy
 
 
 FILES = {

@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from skillweave._internal.policy_protocol import Memoryless
+from skillweave._internal.policy_protocol import Memoryless, Policy
 from skillweave.errors import PolicyError
 from skillweave.policies.core import Choices, RowPolicy, innermost
 from skillweave.policies.functional import Functional, Returns
@@ -91,7 +91,7 @@ class UntrainedHierarchy:
 
     skills: SkillSet
     """The skills; the policies of those that learn are not used."""
-    selector: Any
+    selector: Policy | None
     """The ready selector; None: it learns."""
     guide: ActiveGuide | None = None
     """A ready selector beside the learning one."""

@@ -127,7 +127,7 @@ def test_an_error_that_nobody_expected_is_one_object_and_a_traceback(here: Path)
         "import sys\n"
         "from skillweave.cli import execute, main\n"
         "def fail(command): raise LookupError('a fault of the library')\n"
-        "execute.load = lambda name: fail\n"
+        "execute.resolve = lambda name: fail\n"
         "sys.exit(main())\n"
     )
     done = call("list", "--json", program="broken.py")
@@ -170,7 +170,7 @@ def test_numbers_that_json_lacks_are_null(
     def numbers(command: Any) -> Any:
         return {"a": [float("nan"), 1.5], "b": float("inf")}, ""
 
-    monkeypatch.setattr(execute, "load", lambda name: numbers)
+    monkeypatch.setattr(execute, "resolve", lambda name: numbers)
     assert main(["list", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"a": [None, 1.5], "b": None}
 
