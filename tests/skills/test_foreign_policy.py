@@ -13,9 +13,10 @@ from skills.mapped_models import onnx_model
 from toys import World
 
 from skillweave import Acts, evaluate, from_function, from_onnx, from_sb3, from_torch
-from skillweave.errors import MissingExtra, PolicyError, SkillweaveError
+from skillweave.errors import MissingExtra, PolicyError, RunError, SkillweaveError
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign_policy import Foreign, as_recorded, fitted, source_of
+from skillweave.skills.onnx_file import OnnxPolicy
 
 OBS, ACTION = gym.make("CartPole-v1").observation_space, Discrete(2)
 ROWS = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
@@ -403,3 +404,19 @@ def test_a_copy_that_is_damaged_or_missing_is_said():
         load(now, b"junk")
     with pytest.raises(SkillweaveError, match=r"runs/x.*torch .*Linear.*another checksum"):
         load(now, None)
+
+
+def test_a_file_of_a_skill_is_read_once_and_its_errors_name_the_skill(tmp_path):
+    pytest.importorskip("onnxruntime")
+    path = onnx_file(tmp_path / "x.onnx")
+
+    class Lean(Skill):
+        policy = str(path)
+
+    skill = Lean()
+    first = ready_policy(skill)
+    assert isinstance(first, OnnxPolicy)
+    assert ready_policy(skill) is first
+    Lean.policy = str(tmp_path / "nowhere.onnx")
+    with pytest.raises(RunError, match=r"skill 'lean': policy: .*nowhere\.onnx does not exist"):
+        ready_policy(Lean())
