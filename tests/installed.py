@@ -13,8 +13,17 @@ EXTENSIONS: dict[str, set[str]] = {
     "recipes": set(),
     "demo": {"recipes"},
     "compat": set(),
+    "robots": set(),
 }
 """What each extension may import beside the core: the extensions that it stands on."""
 
-HOMES = {module: homes for module, homes in public.HOMES.items() if find_spec(module)}
+HOMES = {
+    module: {
+        name: home
+        for name, home in homes.items()
+        if find_spec(f"skillweave.{home.split('.')[0]}") is not None
+    }
+    for module, homes in public.HOMES.items()
+    if find_spec(module)
+}
 """By module that users import from: its names, each with the module that defines it."""

@@ -93,6 +93,7 @@ LACKS = {
     "recipes": "command.demo",
     "demo": "command.demo",
     "compat": "command.import-agilerl",
+    "robots": "command.handover",
 }
 
 

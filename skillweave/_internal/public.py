@@ -19,6 +19,7 @@ PUBLIC = {
         "hierarchy.settings": "Apart Guide Selection",
         "networks.config": "Network",
         "policies.core": "Step",
+        "robots.measuring": "handovers",
         "skills": "Reflex Residual Skill from_function from_onnx from_sb3 from_torch tree",
         "skills.automaton": "Automaton",
         "skills.mapping": "Acts Goal LastAction Part",
@@ -74,6 +75,7 @@ PUBLIC = {
         "planning.planner": "Planner",
     },
     "skillweave.reporting": {"reporting.curves_figure": "plot_curves"},
+    "skillweave.robots": {"robots.measured": "Between ChainChance Entry MeasuredHandovers Pair"},
     "skillweave.types": {
         "export.write": "Export",
         "hierarchy.policy": "HierarchyPolicy",
@@ -108,7 +110,9 @@ def lazy(module: str) -> tuple[list[str], Callable[[str], Any], Callable[[], Ite
     def get(name: str) -> Any:
         """Import a public name of the module when it is first used."""
         if name in homes:
-            return getattr(import_module(f"skillweave.{homes[name]}"), name)
+            from skillweave.extensions import resolve
+
+            return resolve(f"skillweave.{homes[name]}:{name}", name)
         if f"{module}.{name}" in HOMES:  # sw.algorithms needs no import of its own
             return import_module(f"{module}.{name}")
         from difflib import get_close_matches

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -163,6 +164,19 @@ class MappedPolicy(Functional, Foreign, Model):
     def takes_goal(self) -> bool:
         """Return whether the goal of a skill is an input of it."""
         return bool(self.mapping.goal_places)
+
+    def with_goal(self, goal: Any) -> Self:
+        """Return a copy with another goal: numbers, or a function of observations.
+
+        Raises:
+            DeclarationError: it takes none, or the goal is out of its range.
+        """
+        aimed = copy.copy(self)
+        try:
+            aimed.mapping = replace(self.mapping, goal=goal)
+        except DeclarationError as error:
+            raise DeclarationError(f"with_goal(): {self.name}: {error}") from None
+        return aimed
 
     def bind_with_goals(
         self, observation_space: Space[Any], action_space: Space[Any], who: str, goals: Goals

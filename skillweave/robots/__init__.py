@@ -1,0 +1,20 @@
+"""Ready policies of one robot: which can follow which.
+
+Begin with ``measuring``, which has ``sw.handovers``; ``chains`` plays calls one after another, and
+``measured`` is what was found.
+"""
+
+from typing import TYPE_CHECKING
+
+from skillweave._internal.public import lazy
+
+if TYPE_CHECKING:
+    from skillweave.robots.measured import (
+        Between as Between,
+        ChainChance as ChainChance,
+        Entry as Entry,
+        MeasuredHandovers as MeasuredHandovers,
+        Pair as Pair,
+    )
+else:
+    __all__, __getattr__, __dir__ = lazy(__name__)

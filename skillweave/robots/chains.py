@@ -1,0 +1,214 @@
+"""Calls one after another on one robot: an environment with settings and a seed of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from skillweave._internal.seeding import Seeds, global_generators
+from skillweave.envs.engine import Engine
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import EnvError
+from skillweave.experience.play import SeededEpisodes, play
+from skillweave.policies.core import EPISODE, RUNNING, Array, Memory, RowPolicy, Step, Turn, part_of
+from skillweave.robots.aims import Aim
+from skillweave.skills.lengths import Lengths
+from skillweave.skills.skill_set import SkillSet, acting_policy
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One robot: the keywords that were drawn for it, and the seed of its resets."""
+
+    number: int
+    seed: int
+    settings: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class PlannedCall:
+    """A call to be played: a skill's place, and its most steps."""
+
+    skill: int
+    steps: int
+    follows: bool = True
+    """It is judged whether what was asked for is followed."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A call that was played."""
+
+    skill: int
+    steps: int
+    done: bool
+    followed: bool
+    """What was asked for was followed, as far as it is judged; of calls that are done."""
+    refused: bool
+    """The skill may not start there."""
+    last: Array
+    """(*obs_shape), the observation after it."""
+
+    @property
+    def counts(self) -> bool:
+        """True if it was done, and did what was asked for."""
+        return self.done and self.followed
+
+
+class Listed(RowPolicy):
+    """A selector that chooses what a list says, in one environment."""
+
+    def __init__(self) -> None:
+        self.choices: list[int] = []
+        """What is chosen next, from the last one on."""
+        self.refused = False
+        """The latest one may not start there."""
+
+    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return the next choice (1,); one that may start where that one may not."""
+        choice = self.choices.pop()
+        self.refused = turn.mask is not None and not turn.mask[0, choice]
+        if self.refused:
+            choice = int(turn.mask[0].argmax())  # type: ignore[index]  # nothing counts any more
+        return np.array([choice])
+
+
+class ChainPlayer:
+    """Plays calls one after another; a context manager, as it keeps an environment open.
+
+    Args:
+        skills: with their policies.
+        aims: what a call of each is for.
+        spec: of the environment, without what is drawn.
+        longest: the most steps of a call.
+    """
+
+    def __init__(self, skills: SkillSet, aims: Sequence[Aim], spec: EnvSpec, longest: int) -> None:
+        self.aims = tuple(aims)
+        self.steps = 0
+        """Steps so far."""
+        self._spec = replace(spec, engine="sync")  # the only one whose resets take seeds
+        self._longest = longest
+        self._listed = Listed()
+        lengths = Lengths(*range(1, longest + 1))
+        self._policy = acting_policy(replace(skills, call_steps=lengths), self._listed)
+        self._engine: Engine | None = None
+        self._settings: dict[str, Any] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._engine is not None:
+            self._engine.close()
+
+    def play(self, robot: Robot, calls: Sequence[PlannedCall]) -> list[Outcome]:
+        """Play calls from a fresh start of a robot, until one of them is not done.
+
+        Raises:
+            EnvError: the environment's time limit comes before the calls are over.
+        """
+        seeds = Seeds(robot.seed) / "chain"
+        with global_generators(seeds):
+            engine = self._open(robot)
+            return self._play(engine, robot, calls, seeds.numpy())
+
+    def _open(self, robot: Robot) -> Engine:
+        """Return the robot's environment: the open one where its settings are the same."""
+        if self._engine is None or robot.settings != self._settings:
+            if self._engine is not None:
+                self._engine.close()
+                self._engine = None
+            spec = replace(self._spec, kwargs={**self._spec.kwargs, **robot.settings})
+            self._engine = make_engine(spec, 1)
+            self._settings = robot.settings
+        return self._engine
+
+    def _play(
+        self, engine: Engine, robot: Robot, calls: Sequence[PlannedCall], rng: np.random.Generator
+    ) -> list[Outcome]:
+        self._listed.choices = [c.skill * self._longest + c.steps - 1 for c in reversed(calls)]
+        episodes = SeededEpisodes(engine, [robot.seed], len(calls) * self._longest + 1)
+        found = list[Outcome]()
+        one = _OpenCall(self.aims[calls[0].skill])
+        for now in play(self._policy, episodes, rng=rng):
+            self.steps += 1
+            call = calls[len(found)]
+            if self._listed.refused:
+                found.append(Outcome(call.skill, 0, False, False, True, now.step.obs[0]))
+                break
+            end = int(now.memory["end"][0])
+            if not one.add(now.step, ended=end != RUNNING):
+                continue
+            found.append(one.played(call))
+            more = len(found) < len(calls)
+            if now.step.truncated[0] and one.ok and (more or self._is_short(one, call, end)):
+                raise EnvError(
+                    f"{self._spec.name}: its time limit ended an episode after "
+                    f"{int(now.step.elapsed[0]):,} steps, before {len(calls)} calls were over: "
+                    "give it a longer limit (max_episode_steps, for example), or shorter calls "
+                    "(steps=, cut=)"
+                )
+            if not more or not found[-1].done or now.over[0]:
+                break
+            one = _OpenCall(self.aims[calls[len(found)].skill])
+        return found
+
+    @staticmethod
+    def _is_short(one: _OpenCall, call: PlannedCall, end: int) -> bool:
+        """Return whether the episode's end has cut a call that would have gone on."""
+        limit = one.aim.skill.max_steps
+        whole = call.steps if limit is None else min(call.steps, limit)
+        return end == EPISODE and len(one) < whole
+
+
+class _OpenCall:
+    """A call in the making."""
+
+    def __init__(self, aim: Aim) -> None:
+        self.aim = aim
+        self.ok = True
+        """What has to stay true has been true so far."""
+        self._done = False
+        self._steps = 0
+        self._kept: list[Step] = []
+        self._last: Step | None = None
+
+    def __len__(self) -> int:
+        return self._steps
+
+    def add(self, step: Step, *, ended: bool) -> bool:
+        """Take in the next step; return whether the call is over, or lost."""
+        aim = self.aim
+        self._steps += 1
+        step = part_of(step, np.array([self._steps]), max_steps=aim.skill.max_steps)
+        self._last = step
+        if aim.follows is not None:
+            self._kept.append(step)
+        if aim.stays is not None:
+            self.ok = aim.holds(aim.stays, step)
+        if aim.done is not None:
+            self._done = self._done or aim.holds(aim.done, step)
+        if aim.by_success and ended:
+            self._done = aim.succeeds(step)
+        if step.terminated[0] and aim.stays is not None and not self._done:
+            self.ok = False  # the episode is over before the call is
+        return ended or not self.ok
+
+    def played(self, call: PlannedCall) -> Outcome:
+        """Return the call, which is over."""
+        assert self._last is not None
+        done = self.ok and (self._done or (self.aim.done is None and not self.aim.by_success))
+        followed = done and (not call.follows or self.aim.is_followed(self._kept))
+        return Outcome(
+            call.skill, self._steps, done, followed, False, self._last.next_obs[0].copy()
+        )

@@ -1,0 +1,31 @@
+"""The command ``skillweave handover``.
+
+Nothing here imports torch, as help reads it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import tyro
+from tyro.conf import Positional
+
+from skillweave.cli.commands import MaybeOut, Output
+
+
+@dataclass(frozen=True)
+class HandoverCommand(Output):
+    """Play each ready policy after each other one, and print which can follow which."""
+
+    file: Positional[str] = tyro.MISSING
+    """A Python file that defines env, skills, steps, and stays or done: the arguments of
+    skillweave.handovers, as variables."""
+    calls: int | None = None
+    """Entries of each pair; default: the file's, or 20."""
+    seed: int | None = None
+    """Of robots and cuts; default: the file's, or 0."""
+    out: MaybeOut = None
+    """A JSON file for all entries."""
+
+
+HANDOVER = HandoverCommand, "skillweave.robots.handover_command:handover"
