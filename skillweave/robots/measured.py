@@ -492,4 +492,6 @@ def _chance(skills: Sequence[str], counts: Sequence[tuple[int, int]]) -> ChainCh
     rng = np.random.default_rng(0)
     draws: Array = rng.beta(done + 0.5, every - done + 0.5, (DRAWS, len(counts))).prod(axis=1)
     low, high = np.quantile(draws, (0.025, 0.975)).tolist()
+    # What always, or never, was done may always, or never, be (Brown, Cai & DasGupta 2001).
+    low, high = (0.0 if estimate == 0 else low), (1.0 if estimate == 1 else high)
     return ChainChance(tuple(skills), estimate, (low, high))
