@@ -506,6 +506,8 @@ class Hierarchy(Trainable, Declaration):
             attributes: dict[str, Any] = {"name": name, "max_steps": entry.max_steps}
             if entry.call_steps is not None:
                 attributes["call_steps"] = entry.call_steps
+            if entry.fade is not None:
+                attributes["fade"] = entry.fade
             attributes |= part_from_json(entry.sees, entry.acts)
             rests[level] = rests.get(level, ZERO) if entry.rest is None else entry.rest
             if entry.hierarchy is not None:

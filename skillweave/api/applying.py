@@ -85,6 +85,10 @@ def _recorded_roles(roles: Roles, run: RunDirectory) -> Roles:
     return roles.changed(recorded)
 
 
+LIMITS = ("max_steps", "call_steps", "fade")
+"""What a run records of a skill's calls, and sets when it is loaded."""
+
+
 def _notice_limits(now: Roles, then: Roles, run: RunDirectory) -> None:
     """Give a notice where limits of calls are declared otherwise than the run records them."""
     changed = []
@@ -93,7 +97,7 @@ def _notice_limits(now: Roles, then: Roles, run: RunDirectory) -> None:
         limits = {f"call_steps{whose}": (level.call_steps, now.levels[path].call_steps)}
         for name, skill in level.skills.items():
             declared = now.levels[path].skills[name]
-            for field in ("max_steps", "call_steps"):
+            for field in LIMITS:
                 both = getattr(skill, field), getattr(declared, field)
                 limits[f"{field} of skill {name!r}"] = both
         changed += [
@@ -111,7 +115,7 @@ def _notice_limits(now: Roles, then: Roles, run: RunDirectory) -> None:
 def _limited(skill: Skill, entry: SkillEntry) -> Skill:
     """Return a copy of a declared skill with the limits of its calls that a run records."""
     limited = copy.copy(skill)
-    for field in ("max_steps", "call_steps"):
+    for field in LIMITS:
         if getattr(skill, field) != getattr(entry, field):
             setattr(limited, field, getattr(entry, field))
     return limited

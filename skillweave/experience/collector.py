@@ -294,7 +294,7 @@ class Collector:
         self._goal_rng = (request.seeds / "goals").numpy()
         rng = (request.seeds / "skills").numpy()
         last = self.kept.get("last_action")
-        self._world = World(rng, self.kept["age"], last, self.overridden)
+        self._world = World(rng, self.kept["age"], last, overridden=self.overridden)
 
     def _writer(self, rows: int) -> TraceWriter:
         """Return a writer for the trace of the next ``rows`` steps."""

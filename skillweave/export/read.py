@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -157,7 +157,7 @@ def _skill_set(deployed: Deployed) -> SkillSet:
     """Return the skills of an exported hierarchy, as reports know them."""
     tree = within(deployed.policy)
     return SkillSet(
-        tuple(map(_recorded, tree.skills)),
+        tuple(_recorded(skill, [one.name for one in tree.skills]) for skill in tree.skills),
         tuple(_policy(skill, deployed) for skill in tree.skills),
         reflexes=_reflexes(deployed.policy),
         call_steps=Lengths(*tree.lengths) if tree.lengths else None,
@@ -176,8 +176,12 @@ def _policy(skill: CalledSkill, deployed: Deployed) -> Policy:
     return Functional(skill.policy, *spaces, joins=skill.goals is not None)
 
 
-def _recorded(called: CalledSkill) -> RecordedSkill:
-    """Return a skill of an exported hierarchy, with the functions that judge its calls."""
+def _recorded(called: CalledSkill, names: Sequence[str]) -> RecordedSkill:
+    """Return a skill of an exported hierarchy, with the functions that judge its calls.
+
+    Args:
+        names: of all skills beside it.
+    """
     methods: dict[str, Any] = {
         name: staticmethod(function)
         for name in ("initiation", "termination", "success")
@@ -189,6 +193,8 @@ def _recorded(called: CalledSkill) -> RecordedSkill:
             methods["clip_goal"] = staticmethod(called.goals.clip)
     skill: RecordedSkill = type("Exported", (RecordedSkill,), methods | {"name": called.name})()
     skill.max_steps, skill.call_steps = called.max_steps, called.limit
+    if any(called.fades):
+        skill.fade = {name: n for name, n in zip(names, called.fades, strict=True) if n}
     return skill
 
 

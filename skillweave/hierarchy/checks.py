@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 from skillweave._internal.messages import short, suggest
@@ -16,6 +16,7 @@ from skillweave.hierarchy.settings import USUAL_CALL_STEPS, Guide
 from skillweave.runs.manifest import Target
 from skillweave.schema import fitted
 from skillweave.skills import Automaton, Skill, ready_policy
+from skillweave.skills.base import RecordedSkill, is_trained
 from skillweave.skills.learnable import learn_on
 from skillweave.skills.lengths import Lengths
 from skillweave.skills.own_part import ZERO, checked_rest
@@ -99,6 +100,7 @@ def check_level(level: Level) -> None:
     _check_calls(level)
     _check_start_calls(level)
     _check_rest(level)
+    _check_fades(level)
 
 
 def _check_selection(level: Level) -> None:
@@ -177,6 +179,24 @@ def _check_calls(level: Level) -> None:
                 f"call_steps is None, but skill {skill.name!r} never ends by itself: give it "
                 "max_steps or termination()"
             )
+
+
+def _check_fades(level: Level) -> None:
+    """Raise a DeclarationError where a skill fades in after one that is not there, or learns."""
+    names = [skill.name for skill in level.skills.values()]
+    for skill in level.skills.values():
+        if skill.fade is None:
+            continue
+        where = f"skill {skill.name!r}: fade"
+        if is_trained(skill) and not isinstance(skill, RecordedSkill):
+            raise DeclarationError(
+                f"{where} is {short(skill.fade)}, but the skill learns, and its actions would not "
+                "be its own: only a ready skill can fade in"
+            )
+        for name in skill.fade if isinstance(skill.fade, Mapping) else ():
+            if name not in names or name == skill.name:
+                others = [other for other in names if other != skill.name]
+                raise DeclarationError(f"{where} names {short(name)}{suggest(name, others)}")
 
 
 def _undoes_call_steps(skill: Skill) -> bool:

@@ -45,6 +45,12 @@ def check_settings(roles: Roles) -> None:
         for config in (level.algorithm, level.selector, level.flat, *of_skills):
             if isinstance(config, AlgorithmConfig):
                 check_rollout(config, spaces.observation)
+        for skill in level.skills.values():
+            if skill.fade is not None and space_of(spaces.action).kind != "Box":
+                raise DeclarationError(
+                    f"skill {skill.name!r}: fade mixes the actions of two skills, which needs "
+                    f"actions of a Box, not {spaces.action}"
+                )
         for reflex in level.reflexes:
             reflex.override(space_of(spaces.action))  # raises where its fixed action does not fit
         if level.guide is not None:

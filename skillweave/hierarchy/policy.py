@@ -62,6 +62,7 @@ class HierarchyPolicy(Functional):
             [s.name, s.max_steps, *([] if s.call_steps is None else [s.call_steps])]
             for s in skill_set.skills
         ]
+        checksums += [["fade", s.name, s.fade] for s in skill_set.skills if s.fade is not None]
         reflexes = [r.name for r in skill_set.reflexes]
         interruption = skill_set.interruption
         if interruption is not None and interruption.critic is not None:

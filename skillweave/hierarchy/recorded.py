@@ -37,6 +37,7 @@ def _skill_entry(roles: Roles, path: str, policy: Policy | None) -> SkillEntry:
         skill.max_steps,
         ready=policy is not None and not isinstance(skill.policy, Residual),
         call_steps=skill.call_steps,
+        fade=skill.fade,
         goal_space=None if skill.goal_space is None else space_to_json(skill.goal_space),
         policy=None if policy is None else source_of(policy),
         hierarchy=level_entry(roles, roles.levels[path]) if path in roles.levels else None,

@@ -190,7 +190,7 @@ def _own_skill(skill: Skill, policy: Policy, view: OwnView) -> Skill:
         return staticmethod(ask)
 
     # Without sees: the policy sees all, and cuts it to its part.
-    fields = "name", "max_steps", "call_steps", "color", "reward_changes"
+    fields = "name", "max_steps", "call_steps", "fade", "color", "reward_changes"
     attributes = {field: getattr(skill, field) for field in (*fields, "goal_space", "acts")}
     attributes |= {method: seeing(method) for method in own_methods(skill)}
     kind = type(type(skill).__name__, (Skill,), attributes | {"policy": policy})

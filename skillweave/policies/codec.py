@@ -406,7 +406,7 @@ def read_folder(
         reader = Reader({name: code[name] for name in content["code"]}, files, arrays)
         found: Deployed = reader.read(Deployed, content["policy"], "policy")
         found.policy.check(found.sees, found.acts, None, "policy")
-        if found.policy.holds:
+        if found.policy.holds and not isinstance(found.policy, mapped.Mapped):
             raise PolicyError("policy holds the last action, but nothing remembers it (Remembers)")
     except PolicyError as error:
         raise RunError(f"{file}: {str(error)[:LONGEST_ERROR]}") from error

@@ -188,10 +188,19 @@ class World:
     """(N,), steps of the episodes so far, for messages."""
     last_action: Array | None = None
     """(N, …), the last actions of the environments; None: nobody needs them."""
+    acted: Array | None = None
+    """(N,) bool, where their episodes have a last action; None: where ``age`` is over 0."""
     overridden: Array | None = None
     """(N,) bool, set where a reflex acts."""
     trace: Any = None
     """Writer of learning policies' columns, ``write(rows, **columns)``; None: none is kept."""
+
+    def has_acted(self, rows: Array) -> Array:
+        """Return where the last action is of the episode in environments ``rows``, (k,) bool."""
+        if self.acted is not None:
+            return np.asarray(self.acted[rows])
+        nowhere = np.zeros(len(rows), bool)
+        return nowhere if self.age is None else np.asarray(self.age[rows] > 0)
 
 
 @dataclass(slots=True)
@@ -252,6 +261,8 @@ class RowPolicy:
     """Each call with a goal begins with a fresh memory."""
     holds = False
     """The last action of the environment counts."""
+    forgets = False
+    """It begins something anew where it is called again at once."""
 
     def start(self, n: int) -> Memory:
         """Return the memory of n environments in which it has not acted yet."""
@@ -267,6 +278,12 @@ class RowPolicy:
 
     def observe(self, memory: Memory, rows: Array, step: Step) -> None:
         """Notice a step of environments ``rows`` (k,); ``memory`` is changed in place."""
+
+    def again(self, memory: Memory, rows: Array) -> None:
+        """Begin anew, in environments ``rows`` (k,), what is not to outlast a call.
+
+        Only where its skill is called again at once; after another skill all begins anew.
+        """
 
     def startable(self, obs: Array) -> Array:
         """Return where it may start, (k,) bool, for observations (k, …)."""
@@ -306,6 +323,7 @@ class Around(RowPolicy):
         self.restricts = policy.restricts
         self.fresh_calls = policy.fresh_calls
         self.holds = policy.holds
+        self.forgets = policy.forgets
 
     def start(self, n: int) -> Memory:
         """Return the policy's fresh memory."""
@@ -318,6 +336,10 @@ class Around(RowPolicy):
     def observe(self, memory: Memory, rows: Array, step: Step) -> None:
         """Let the policy notice a step."""
         self.policy.observe(memory, rows, step)
+
+    def again(self, memory: Memory, rows: Array) -> None:
+        """Let the policy begin anew what is not to outlast a call."""
+        self.policy.again(memory, rows)
 
     def startable(self, obs: Array) -> Array:
         """Return where the policy may start."""

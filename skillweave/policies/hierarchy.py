@@ -7,7 +7,9 @@ A ``CallAndReturn`` remembers, for each environment:
 - ``end``: why the latest call ended (``CallEnd``), RUNNING where it has not;
 - ``goal``: by the place of a skill with goals, that of its latest call;
 - by the place of each skill what its policy remembers; ``selector`` and ``guide``: the same;
-- ``chances``: how likely the guide's latest choices were.
+- ``chances``: how likely the guide's latest choices were;
+- ``before``: where skills fade in, the skill before while it acts on, else −1; ``before_elapsed``:
+  the steps of its call, which count on; ``faded``: the steps since the other one acts.
 """
 
 from __future__ import annotations
@@ -46,6 +48,7 @@ from .core import (
     take,
 )
 from .leaves import Selector
+from .mapped import LONGEST, mixed
 from .parts import GOAL, OBSERVATION, joined, joint_dtype, with_goal
 from .spaces import Space, discrete
 
@@ -136,8 +139,13 @@ class CalledSkill:
     success: Callable[..., Any] | None = code("a Step to (n,) bool", "success", needed=False)
     goals: Any = field(default=None, metadata={"kind": CallGoals | None})
     """``CallGoals``, or what else has their methods; None: it has none."""
+    fades: tuple[int, ...] = ()
+    """By the place of the skill before, the steps in which that one acts on, and actions mix; 0:
+    none. (): after none."""
 
     def __post_init__(self) -> None:
+        if any(not 0 <= steps <= LONGEST for steps in self.fades):
+            raise PolicyError(f"fades are {self.fades}; they must be 0 to {LONGEST:,} steps")
         for name in ("limit", "max_steps"):
             steps = getattr(self, name)
             if steps is not None and steps < 1:
@@ -205,7 +213,7 @@ class CallAndReturn(Choices, RowPolicy):
         call_user: calls a function of a user, and checks its answer.
 
     Raises:
-        PolicyError: lengths do not rise.
+        PolicyError: lengths do not rise, or a skill's ``fades`` are of other skills.
     """
 
     watches = True
@@ -234,6 +242,15 @@ class CallAndReturn(Choices, RowPolicy):
         self._fresh = np.array(
             [s.goals is not None and s.policy.fresh_calls for s in self.skills], bool
         )
+        count = len(self.skills)
+        if wrong := [s.name for s in self.skills if s.fades and len(s.fades) != count]:
+            raise PolicyError(f"skill {wrong[0]!r}: fades must have {count} numbers")
+        none = (0,) * count
+        self._fades: Array | None = None
+        """(S, S), the steps in which a skill, the row, fades in after another one."""
+        if any(any(s.fades) for s in self.skills):
+            self._fades = np.array([s.fades or none for s in self.skills])
+        self._again = [i for i, s in enumerate(self.skills) if s.policy.forgets]
         guide = None if self.guide is None else self.guide.selector
         ready = {"selector": self.selector, "guide": guide}
         self._ready = {name: who for name, who in ready.items() if isinstance(who, Selector)}
@@ -247,6 +264,10 @@ class CallAndReturn(Choices, RowPolicy):
         }
         if self.lengths:
             memory["length"] = np.zeros(n, np.int64)
+        if self._fades is not None:
+            memory["before"] = np.full(n, -1)
+            memory["before_elapsed"] = np.zeros(n, np.int64)
+            memory["faded"] = np.zeros(n, np.int64)
         if self.goals:
             memory["goal"] = {str(i): goals.start(n) for i, goals in self.goals.items()}
         memory |= {str(i): skill.policy.start(n) for i, skill in enumerate(self.skills)}
@@ -278,6 +299,7 @@ class CallAndReturn(Choices, RowPolicy):
         running = memory["skill"][rows]
         actions = None
         own = Turn(turn.world, turn.mask, None, self.greedy)
+        fades = self._fades is not None
         for i, mine in _by_skill(running):
             every = len(mine) == len(rows)
             part = own if every else own.some(mine)
@@ -286,11 +308,42 @@ class CallAndReturn(Choices, RowPolicy):
             seen = obs if every else obs[mine]
             some = self.skills[i].policy.act(memory[str(i)], at, seen, part)
             if every:
-                return some
+                return self._faded(memory, rows, obs, own, some) if fades else some
             if actions is None:
                 actions = np.zeros((len(rows), *some.shape[1:]), some.dtype)
             actions[mine] = some
         assert actions is not None, "no call runs"
+        return self._faded(memory, rows, obs, own, actions) if fades else actions
+
+    def _faded(self, memory: Memory, rows: Array, obs: Array, turn: Turn, actions: Array) -> Array:
+        """Return actions (k, …) in which those of the skill before fade out."""
+        before = memory["before"][rows]
+        mixing = np.flatnonzero(before >= 0)
+        if not len(mixing):
+            return actions
+        assert self._fades is not None
+        steps = self._fades[memory["skill"][rows[mixing]], before[mixing]]
+        memory["faded"][rows[mixing]] += 1
+        share = memory["faded"][rows[mixing]] / steps
+        goes_on = share < 1.0
+        memory["before"][rows[mixing[~goes_on]]] = -1
+        mixing, share = mixing[goes_on], share[goes_on]
+        # What learns records nothing here: it is another skill's call.
+        world = turn.world
+        beside = World(world.rng, world.age, world.last_action, world.acted)
+        for i, mine in _by_skill(before[mixing]):
+            skill, at = self.skills[i], rows[mixing[mine]]
+            if skill.policy.restricts:
+                stuck = skill.policy.stuck(memory[str(i)], at, obs[mixing[mine]])
+                mine = mine[~np.broadcast_to(stuck, mine.shape)]
+                at = rows[mixing[mine]]
+            if not len(mine):
+                continue
+            part = turn.some(mixing[mine])
+            part.world = beside
+            part.goal = self.goal_of(memory, i, at)
+            theirs = skill.policy.act(memory[str(i)], at, obs[mixing[mine]], part)
+            actions = mixed(actions, theirs, share[mine], mixing[mine])
         return actions
 
     def _choice(
@@ -372,7 +425,18 @@ class CallAndReturn(Choices, RowPolicy):
             memory["goal"][str(i)][rows[mine]] = goals[i][mine]
         if self.lengths:
             memory["length"][rows] = np.array(self.lengths)[choice % self.each]
-        fresh = (memory["skill"][rows] != skill) | self._fresh[skill]
+        before = memory["skill"][rows]
+        fresh = (before != skill) | self._fresh[skill]
+        if self._fades is not None:
+            other = before != skill
+            at = rows[other]
+            fades = (before >= 0) & (self._fades[skill, before] > 1)
+            memory["before"][at] = np.where(fades, before, -1)[other]
+            memory["before_elapsed"][at] = memory["elapsed"][at]
+            memory["faded"][at] = 0
+        for i in self._again:
+            if len(mine := rows[~fresh & (skill == i)]):
+                self.skills[i].policy.again(memory[str(i)], mine)
         memory["skill"][rows] = skill
         memory["elapsed"][rows] = 0
         memory["end"][rows] = RUNNING
@@ -543,6 +607,8 @@ class CallAndReturn(Choices, RowPolicy):
                 end[
                     mine[self.call_user(skill.termination, part, at, skill.path, "termination")]
                 ] = OWN
+        if self._fades is not None:
+            self._watch_before(memory, rows, own)
         if self.interruption is not None:
             self._interrupt(self.interruption, memory, rows, step, end)
         end_with_episode(end, step.terminated | step.truncated)
@@ -561,6 +627,21 @@ class CallAndReturn(Choices, RowPolicy):
                 )
         for name, who in self._ready.items():
             who.watch(memory[name], rows, step, LastCall(running, end, succeeded))
+
+    def _watch_before(self, memory: Memory, rows: Array, own: Step) -> None:
+        """Let the policies of skills that fade out notice a step, as one of their own call."""
+        before = memory["before"][rows]
+        fading = np.flatnonzero(before >= 0)
+        memory["before_elapsed"][rows[fading]] += 1
+        for i, some in _by_skill(before[fading]):
+            skill = self.skills[i]
+            if not skill.policy.watches:
+                continue
+            mine = fading[some]
+            at = rows[mine]
+            elapsed = memory["before_elapsed"][at]
+            seen = part_of(own, elapsed, mine, skill.max_steps, self.goal_of(memory, i, at))
+            skill.policy.observe(memory[str(i)], at, seen)
 
     def _interrupt(
         self, how: Interruption, memory: Memory, rows: Array, step: Step, end: Array
@@ -592,6 +673,8 @@ class CallAndReturn(Choices, RowPolicy):
         names = [skill.name for skill in self.skills]
         if not names or len(set(names)) < len(names):
             raise PolicyError(f"{where}.skills are {names}; they must have names of their own")
+        if self._fades is not None and acts.kind != "Box":
+            raise PolicyError(f"{where}: fades need actions of a Box, but they are of {acts}")
         seen = sees if goal is None or not self.fresh_calls else with_goal(sees, goal)
         choice = plain = discrete(self.choices)
         spaces = {self.skills[i].name: own.space for i, own in self.goals.items()}

@@ -20,6 +20,10 @@ Shapes = Mapping[str, tuple[int | None, ...] | None]
 """Shapes of a model's inputs for one environment, by name; None: unknown."""
 HERE = {"written": False}
 """Metadata of fields that serve messages; files do not contain them."""
+ANEW = {"state": "state", "last_action": "last", "held": "phase"}
+"""What may begin anew in each call, and its name in the memory."""
+UNKNOWN = -1
+"""In place of the steps that are left of a ramp: it is not known yet whether there is one."""
 LONGEST = 100_000
 """The most steps of an action, and the most actions of an inference: all are remembered."""
 NUMBERS: dict[str, type[np.generic]] = {
@@ -66,6 +70,10 @@ class Take:
     """The lowest goal: one number, or one for each; None: any."""
     high: Array | None = None
     """The highest goal."""
+    held: tuple[int, ...] = ()
+    """Places among its numbers that it does not read: others drive them."""
+    held_at: Array | None = None
+    """(len(held),) what stands there."""
     who: str = field(default="a function", metadata=HERE)
     """Begins messages."""
 
@@ -93,6 +101,12 @@ class Take:
         if self.whole and (self.choices or self.places is not None):
             raise PolicyError("Take.whole is true, but Take.choices or Take.places are given")
         _check_sizes(self, (self.size,), "low", "high")
+        if self.held:
+            check_places(self.held, self.size, "Take.held", once=True)
+        known = np.zeros(0) if self.held_at is None else self.held_at
+        if np.shape(known) != (len(self.held),) or (self.held and self.whole):
+            raise PolicyError(f"Take.held_at is {self.held_at} for Take.held {self.held}")
+        self._held = np.array(self.held, np.int64)
         if self.source in ("goal", "last_action") and len(self.shape) != 1:
             raise PolicyError(f"Take.shape is {self.shape}, but a {self.source} is (numbers,)")
 
@@ -128,7 +142,11 @@ class Take:
             found = hot[0] if len(hot) == 1 else np.concatenate(hot, axis=1)
         elif found.ndim != 2:
             found = found.reshape(len(found), -1)
-        return found if self._places is None else found[:, self._places]
+        found = found if self._places is None else found[:, self._places]
+        if self.held:
+            found = found.astype(np.float64)  # so that a default pose is met to the last bit
+            found[:, self._held] = self.held_at
+        return found
 
 
 def _one_hot(choice: Array, count: int) -> Array:
@@ -224,6 +242,23 @@ class Input:
                     f"{where} takes {take.name} of shape {take.shape}, but observations "
                     f"are of {sees}"
                 )
+
+
+def mixed(action: Array, other: Array, share: Array, rows: Array) -> Array:
+    """Return real actions (k, …), in some rows mixed with others.
+
+    Args:
+        other: (m, …), of these rows.
+        share: (m,) of ``action`` in the mixture.
+        rows: (m,).
+    """
+    if not len(rows):
+        return action
+    found = action.copy()
+    share = share.reshape(-1, *(1,) * (action.ndim - 1))
+    both = share * action[rows] + (1.0 - share) * other
+    found[rows] = np.rint(both) if action.dtype.kind in "iu" else both
+    return found
 
 
 def clipped(x: Array, low: Array | float | None, high: Array | float | None) -> Array:
@@ -727,6 +762,10 @@ class Mapped(RowPolicy):
     """(G,) or a function: the goal, where the call that it acts in has none."""
     goal_space: Space | None = None
     """The space of the goals of calls; None: such a goal is numbers (n, G)."""
+    ramp: int = 0
+    """The steps, after another skill's, in which actions come from the last one; 0: none."""
+    anew: tuple[str, ...] = ()
+    """What begins anew where it is called again at once: of ``ANEW``."""
     who: str = field(default="the policy", metadata=HERE)
     """Begins messages."""
     warn: Callable[[str], None] | None = field(default=None, repr=False, metadata=HERE)
@@ -739,6 +778,14 @@ class Mapped(RowPolicy):
             count = getattr(self, name)
             if count is not None and not 1 <= count <= LONGEST:
                 raise PolicyError(f"Mapped.{name} is {count}; it must be 1 to {LONGEST:,}")
+        if not 0 <= self.ramp <= LONGEST:
+            raise PolicyError(f"Mapped.ramp is {self.ramp}; it must be 0 to {LONGEST:,}")
+        if self.ramp and self.outputs.space.kind != "Box":
+            raise PolicyError(f"{self.who}: ramp needs actions of a Box, not {self.outputs.space}")
+        if unknown := [name for name in self.anew if name not in ANEW]:
+            raise PolicyError(f"Mapped.anew has {unknown[0]!r}; there are: {', '.join(ANEW)}")
+        self.holds = self.ramp > 0
+        self.forgets = bool(self.anew)
         self.period = self.every * (self.chunk or 1)
         """The number of steps from one inference to the next."""
         space = self.outputs.space
@@ -852,11 +899,25 @@ class Mapped(RowPolicy):
             space = self.outputs.space
             memory["phase"] = np.zeros(n, np.int64)
             memory["held"] = np.zeros((n, self.chunk or 1, *space.shape), space.record)
+        if self.ramp:
+            space = self.outputs.space
+            memory["ramp"] = np.full(n, UNKNOWN)
+            memory["from"] = np.zeros((n, *space.shape), space.record)
         return memory
+
+    def again(self, memory: Memory, rows: Array) -> None:
+        """Begin anew what ``anew`` names."""
+        names = {name: ANEW[name] for name in self.anew}
+        fresh = self.start(len(rows))
+        for key, value in fresh.items():
+            if any(key == known or key.startswith(f"{known}.") for known in names.values()):
+                memory[key][rows] = value
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return actions (k, …), of this inference or of an earlier one."""
         action = self._acted(memory, rows, obs, turn)
+        if self.ramp:
+            action = self._ramped(memory, rows, action, turn.world)
         if self.warn is not None:
             if self.on_sample and not turn.greedy:
                 self.warn(self.on_sample)
@@ -865,6 +926,23 @@ class Mapped(RowPolicy):
                 self.warn(text)
                 self.warn = None
         return action
+
+    def _ramped(self, memory: Memory, rows: Array, action: Array, world: World) -> Array:
+        """Return actions (k, …) that come, step by step, from the last one before its first."""
+        left = memory["ramp"][rows]
+        if not left.any():
+            return action
+        begin = np.flatnonzero(left == UNKNOWN)
+        if len(begin):
+            left[begin] = 0  # an episode's first action comes from nowhere
+            if world.last_action is not None:
+                at = rows[begin]
+                left[begin] = self.ramp * world.has_acted(at)
+                memory["from"][at] = world.last_action[at]
+        share = (self.ramp - left + 1) / self.ramp
+        mixing = np.flatnonzero(left > 1)
+        memory["ramp"][rows] = np.maximum(left - 1, 0)
+        return mixed(action, memory["from"][rows[mixing]], share[mixing], mixing)
 
     def _forbidden(self, action: Array, mask: Array) -> str:
         """Return a notice about actions (k, …) that a mask (k, A) forbids; empty: there is none."""

@@ -17,7 +17,7 @@ from .spaces import Space, allows_each, at
 
 OBSERVATION, GOAL = "observation", "goal"
 """The parts of what a skill with a goal observes."""
-OWN_GOAL, LAST_ACTION = "_goal", "_last_action"
+OWN_GOAL, LAST_ACTION, ACTED = "_goal", "_last_action", "_acted"
 """Names under which ``Given`` and ``Remembers`` remember, beside those of their policy."""
 
 
@@ -93,6 +93,8 @@ class Corrects(Around):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.watches = self.policy.watches or self.base.watches
+        self.holds = self.policy.holds or self.base.holds
+        self.forgets = self.policy.forgets or self.base.forgets
 
     def start(self, n: int) -> Memory:
         """Return the memories of both."""
@@ -101,7 +103,9 @@ class Corrects(Around):
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return corrected actions; the base policy acts greedily, and without a mask."""
         own = self.policy.act(memory["own"], rows, obs, turn)
-        alone = Turn(World(turn.world.rng), None, turn.goal)
+        world = turn.world
+        beside = World(world.rng, world.age, world.last_action, world.acted)
+        alone = Turn(beside, None, turn.goal)
         return self.correction.apply(self.base.act(memory["base"], rows, obs, alone), own)
 
     def check(self, sees: Space, acts: Space, goal: Space | None, where: str) -> None:
@@ -115,6 +119,11 @@ class Corrects(Around):
         own = Space("Box", "float32", acts.shape, np.asarray(-1.0), np.asarray(1.0))
         self.policy.check(sees, own, goal, f"{where}.policy")
         self.base.check(sees, acts, goal, f"{where}.base")
+
+    def again(self, memory: Memory, rows: Array) -> None:
+        """Let both begin anew what is not to outlast a call."""
+        self.policy.again(memory["own"], rows)
+        self.base.again(memory["base"], rows)
 
     def observe(self, memory: Memory, rows: Array, step: Step) -> None:
         """Let both notice a step."""
@@ -350,7 +359,10 @@ class PartOf(Around):
         """Return whole actions (k, …)."""
         part = self.part
         last = turn.world.last_action
-        own = Turn(turn.world, part.mask(turn.mask), turn.goal, turn.greedy)
+        world = turn.world
+        if last is not None and self.policy.holds:
+            world = replace(world, last_action=part.read(last))
+        own = Turn(world, part.mask(turn.mask), turn.goal, turn.greedy)
         actions = self.policy.act(memory, rows, part.see(obs), own)
         actions = part.write(actions, None if last is None else last[rows])
         part.check_mask(turn.mask, actions)
@@ -493,14 +505,16 @@ class Remembers(Around):
 
     def start(self, n: int) -> Memory:
         """Return the policy's memory with a last action."""
-        return self.policy.start(n) | {LAST_ACTION: self.space.start(n)}
+        return self.policy.start(n) | {LAST_ACTION: self.space.start(n), ACTED: np.zeros(n, bool)}
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return the policy's actions; who needs the last ones finds them in the world."""
         turn.world.last_action = memory[LAST_ACTION]
+        turn.world.acted = memory[ACTED]
         return self.policy.act(memory, rows, obs, turn)
 
     def observe(self, memory: Memory, rows: Array, step: Step) -> None:
         """Remember the actions of a step."""
         memory[LAST_ACTION][rows] = step.action
+        memory[ACTED][rows] = True
         self.policy.observe(memory, rows, step)

@@ -110,6 +110,8 @@ class SkillEntry:
     max_steps: AtLeastOne | None
     ready: bool = False
     call_steps: AtLeastOne | None = None
+    fade: AtLeastOne | dict[str, AtLeastOne] | None = None
+    """The steps in which the skill before acts on, perhaps by its name."""
     goal_space: dict[str, Any] | None = None
     """The space of its goals, if it has some."""
     sees: Any = None

@@ -59,6 +59,8 @@ Color = Annotated[
     ),
 ]
 """Red, green and blue."""
+Fade = AtLeastOne | dict[str, AtLeastOne]
+"""The steps in which the skill before acts on, perhaps by its name."""
 _Method = Annotated[Callable[..., Any], Check("a method")]
 
 _PARAMETERS = {
@@ -89,6 +91,10 @@ class Skill:
         name: used in messages, files and captions; default: the class name in lower case.
         max_steps: the most steps until the skill stops; None: it stops only by ``termination``.
         call_steps: the most steps of a call, wherever it is trained; None: the hierarchy's.
+        fade: the steps of a call in which the skill before acts on, and both actions are mixed: the
+            k-th of n steps has k/n of this skill's. A number, or numbers by the name of the skill
+            before. Only of a skill that is ready, with actions of a Box. None: it takes over at
+            once.
         steps: training steps where it learns apart; None: its share of ``Hierarchy.steps``.
         task_weight: weight of the task's advantage beside its own reward where skills learn
             together; None: ``Together.task_weight`` (1). 0: only its own reward counts, as it
@@ -122,6 +128,7 @@ class Skill:
     name: str = ""
     max_steps: AtLeastOne | None = None
     call_steps: AtLeastOne | None = None
+    fade: Fade | None = None
     steps: AtLeastOne | None = None
     task_weight: NonNegative | None = None
     algorithm: Any = None
@@ -228,7 +235,7 @@ class Skill:
                 f"{where}: the name names files too; use letters, digits, '_' and '-', at most 64"
             )
         kinds = annotations_of(Skill)
-        for field in ("color", "goal_space"):
+        for field in ("color", "goal_space", "fade"):
             fitted(kinds[field], getattr(self, field), f"{where}: {field}")
         for field in ("max_steps", "call_steps", "reward_changes", *_OF_TRAINING):
             value = getattr(self, field)

@@ -99,7 +99,8 @@ class _Reader:
             where: begins messages.
         """
         if isinstance(source, Part):
-            return self._reads(source, alone, where)
+            alone = alone and source.held is None
+            return self._hidden(self._reads(source, alone, where), source, where)
         if isinstance(source, Goal):
             if "goal" not in self.own:
                 raise PolicyError(
@@ -156,6 +157,34 @@ class _Reader:
             inner = tuple((places[run] - first[leaf]).tolist())
             found.append(replace(takes[leaf], places=inner))
         return found
+
+    def _hidden(self, takes: list[Take], part: Part, where: str) -> list[Take]:
+        """Return the ``Take`` of each leaf that a part reads, without the numbers that are held."""
+        if part.held is None:
+            return takes
+        sizes = [take.size for take in takes]
+        every = sizes
+        if part.places is not None:
+            every = [take.size for take in self._reads(replace(part, places=None), False, where)]
+        own = places_in(part.places, sum(every), f"{where}.places")
+        held = np.isin(own, places_in(part.held, sum(every), f"{where}.held"))
+        if not held.any():
+            raise PolicyError(f"{where}.held names no number that the part reads")
+        if part.held_at is None:
+            values = _wide(part.offset, sum(sizes), f"{where}.offset")[held]
+        else:
+            values = _wide(part.held_at, int(held.sum()), f"{where}.held_at")
+        at = np.zeros(len(own))
+        at[held] = values
+        ends = np.cumsum(sizes)[:-1]
+        return [
+            replace(take, held=tuple(np.flatnonzero(mine).tolist()), held_at=numbers[mine])
+            if mine.any()
+            else take
+            for take, mine, numbers in zip(
+                takes, np.split(held, ends), np.split(at, ends), strict=True
+            )
+        ]
 
     def _take(self, path: tuple[str, ...], part: Part, whole: bool = False) -> Take:
         """Return the ``Take`` of a whole leaf; choices are one-hot where the part says so."""
@@ -279,7 +308,7 @@ def fitted_outputs(acts: Acts | None, space: Space[Any], who: str, logits: bool)
         return meaning
     if choice and not acts.plain:
         raise PolicyError(
-            f"{who}: acts has scale, offset, clip or rest, but actions are choices of "
+            f"{who}: acts has scale, offset, clip, rest or ramp, but actions are choices of "
             f"{space}; only to applies there"
         )
     if choice and acts.to is None:

@@ -108,8 +108,9 @@ class MappedPolicy(Functional, Foreign, Model):
             elif goal is not None:
                 own["goal"] = goal.shape
             inputs = for_model(fitted_inputs(mapping, seen, who, own), model.expected, who)
-        every, chunk = mapping.every, mapping.chunk
-        return Mapped(model, outputs, inputs, every, chunk, goal, goal_space, who, notice)
+        ramp = 0 if mapping.acts is None else mapping.acts.ramp
+        how = mapping.every, mapping.chunk, goal, goal_space, ramp, mapping.anew
+        return Mapped(model, outputs, inputs, *how, who, notice)
 
     def try_out(self) -> None:
         """Act once on two example observations, and look at a model's outputs.

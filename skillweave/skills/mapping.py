@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields, is_dataclass
 from itertools import count
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -62,6 +62,8 @@ Numbers = Annotated[Any, Check("a finite number, or a list of such", convert=flo
 """A number, or one for each of several."""
 Range = Annotated[Any, Check("the lowest and the highest number: (-1.0, 1.0)", convert=_range)]
 """The lowest and the highest number."""
+Anew = Literal["state", "last_action", "held"]
+"""What a policy remembers, and may begin anew in each call."""
 Places = Annotated[Any, Check("a slice, or a list of places, counted from 0", convert=_places)]
 """A slice or a tuple of places."""
 GoalValue = (
@@ -75,6 +77,7 @@ GoalValue = (
     | None
 )
 """The goal of a policy."""
+_Ramp = Annotated[int, Check(f"0 to {LONGEST:,} steps", lambda x: 0 <= x <= LONGEST)]
 _Steps = Annotated[int, Check(f"at least 1 and at most {LONGEST:,}", lambda x: 1 <= x <= LONGEST)]
 
 
@@ -120,6 +123,12 @@ class Part(Scaling):
     _: KW_ONLY
     one_hot: bool = True
     """False: a choice stays one number."""
+    held: Places | None = None
+    """Places, counted as ``places`` are, that the policy is not shown, since others drive them: the
+    arms, for a walk that is to believe that they hang still. None: none."""
+    held_at: Numbers | None = None
+    """What it is shown there instead, before offset and scale: a number, or one for each of
+    ``held``. None: the offset, so the default pose."""
 
 
 @settings
@@ -203,6 +212,9 @@ class Acts:
     """The lowest and the highest output, before scaling."""
     rest: Numbers | None = None
     """The other numbers of the action, where ``to`` is a part of it: a number, or one for each."""
+    ramp: _Ramp = 0
+    """The steps in which the action goes from the robot's last one to the policy's, in a call that
+    follows another skill's; 0: none. The k-th of n steps has k/n of the policy's."""
 
     def __post_init__(self) -> None:
         if isinstance(self.to, tuple) and len(set(self.to)) != len(self.to):
@@ -213,7 +225,8 @@ class Acts:
     @property
     def plain(self) -> bool:
         """Return whether outputs keep their values."""
-        return self.scale == 1.0 and self.offset == 0.0 and self.clip is None and self.rest is None
+        kept = self.scale == 1.0 and self.offset == 0.0 and self.clip is None
+        return kept and self.rest is None and not self.ramp
 
 
 # All of it
@@ -244,6 +257,8 @@ class PolicyMapping:
     """A module takes and returns one array as its state, not a tuple."""
     scaling: dict[str, Scaling] = field(default_factory=dict)
     """A last scaling of whole inputs: the statistics of ``VecNormalize``."""
+    anew: tuple[str, ...] = ()
+    """What begins anew in each call, also where the skill is called again at once."""
 
     def sources(self) -> list[Source]:
         """Return the parts of all inputs."""
@@ -256,6 +271,7 @@ class PolicyMapping:
 
     def __post_init__(self) -> None:
         kinds: dict[str, Any] = {"goal": GoalValue, "every": _Steps, "chunk": _Steps | None}
+        kinds["anew"] = tuple[Anew, ...]
         for name, kind in kinds.items():
             object.__setattr__(self, name, fitted(kind, getattr(self, name), name))
         if self.goal is not None and not self.goal_places:
@@ -310,7 +326,8 @@ class PolicyMapping:
         single = data.get("single_state", False)
         every = data.get("every", 1)
         chunk = data.get("chunk")
-        return cls(sees, goal, acts, every, chunk, state, single, scaling)
+        anew = tuple(data.get("anew", ()))
+        return cls(sees, goal, acts, every, chunk, state, single, scaling, anew)
 
 
 def mapping_of(
@@ -322,6 +339,7 @@ def mapping_of(
     chunk: Any = None,
     state: Any = None,
     scaling: Mapping[str, Scaling] | None = None,
+    anew: Any = (),
 ) -> PolicyMapping:
     """Return the mapping that a user declares by arguments of ``from_onnx`` and its like.
 
@@ -336,7 +354,8 @@ def mapping_of(
         parts = None if sees is None else checked_sees(sees)
         meaning = _checked_acts(acts)
         scalings = dict(scaling or {})
-        return PolicyMapping(parts, goal, meaning, every, chunk, states, single, scalings)
+        anew = (anew,) if isinstance(anew, str) else anew
+        return PolicyMapping(parts, goal, meaning, every, chunk, states, single, scalings, anew)
     except DeclarationError as error:
         raise DeclarationError(f"{who}: {error}") from None
 

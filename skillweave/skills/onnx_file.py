@@ -169,6 +169,7 @@ def from_onnx(
     every: int = 1,
     chunk: int | None = None,
     state: Any = None,
+    anew: Any = (),
     observation_space: Any = None,
     action_space: Any = None,
 ) -> OnnxPolicy:
@@ -195,6 +196,9 @@ def from_onnx(
             (n, H, ...): a sequence of H actions. None: an inference gives one action.
         state: the recurrent state: the name of the output that is the next state, by the name of
             each input: ``{"h_in": "h_out"}``. It starts with zeros.
+        anew: what begins anew where the skill is called again at once: "state", "last_action",
+            "held" (of ``every`` and ``chunk``), or several. The rest goes on, clocks too; after
+            another skill's call all begins anew.
         observation_space: None: the environment's.
         action_space: None: the environment's.
 
@@ -207,7 +211,7 @@ def from_onnx(
         DeclarationError: an argument is wrong; the message names it.
         MissingExtra: the extra 'onnx' is not installed.
     """
-    mapping = mapping_of("from_onnx()", sees, goal, acts, every, chunk, state)
+    mapping = mapping_of("from_onnx()", sees, goal, acts, every, chunk, state, anew=anew)
     if mapping.state and not isinstance(state, dict):
         raise DeclarationError(
             "from_onnx(): state gives shapes; name the inputs and outputs of the file: "

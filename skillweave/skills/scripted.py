@@ -141,6 +141,7 @@ def from_function(
     every: int = 1,
     chunk: int | None = None,
     state: Any = None,
+    anew: Any = (),
     observation_space: Any = None,
     action_space: Any = None,
 ) -> ScriptedPolicy:
@@ -166,6 +167,9 @@ def from_function(
         chunk: the number of actions that are used of each result (n, H, ...).
         state: the shape of a recurrent state, None as the axis of the environments: (None, 8); or a
             list of shapes. It starts with zeros.
+        anew: what begins anew where the skill is called again at once: "state", "last_action",
+            "held" (of ``every`` and ``chunk``), or several. The rest goes on, clocks too; after
+            another skill's call all begins anew.
         observation_space: None: the environment's.
         action_space: None: the environment's.
 
@@ -179,5 +183,5 @@ def from_function(
         raise DeclarationError(
             f"from_function takes a function of observations, not {short(function)}"
         )
-    mapping = mapping_of("from_function()", sees, goal, acts, every, chunk, state)
+    mapping = mapping_of("from_function()", sees, goal, acts, every, chunk, state, anew=anew)
     return ScriptedPolicy(function, observation_space, action_space, mapping)

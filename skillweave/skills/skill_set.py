@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -71,7 +72,10 @@ class SkillSet(LimitedCalls):
     def action_space(self) -> gym.Space[Any]:
         """The environment's space of actions."""
         part = next((part for part in self.parts if part is not None), None)
-        return self.policies[0].action_space if part is None else part.whole_action_space
+        if part is not None:
+            return part.whole_action_space
+        space: gym.Space[Any] = next(p for p in self.policies if p is not None).action_space
+        return space
 
     def part(self, i: int) -> OwnPart | None:
         """Return the own part of skill ``i``; None: it has all."""
@@ -214,9 +218,18 @@ def _skill(skills: SkillSet, i: int) -> CalledSkill:
     path, goals = path_of(skill), goals_of(skill)
     policy = _whole(skills.policies[i], skill, skills.part(i))
     asks = {name: getattr(skill, name) for name in ENDS if skill.defines(name)}
+    fades = fades_of(skill, [s.name for s in skills.skills])
     return CalledSkill(
-        skill.name, path, policy, skills.limit(i), skill.max_steps, goals=goals, **asks
+        skill.name, path, policy, skills.limit(i), skill.max_steps, goals=goals, fades=fades, **asks
     )
+
+
+def fades_of(skill: Skill, names: Sequence[str]) -> tuple[int, ...]:
+    """Return, by the place of the skill before, the steps in which a skill fades in; (): none."""
+    if skill.fade is None:
+        return ()
+    by_name = skill.fade if isinstance(skill.fade, Mapping) else dict.fromkeys(names, skill.fade)
+    return tuple(0 if name == skill.name else by_name.get(name, 0) for name in names)
 
 
 def _remembering(policy: RowPolicy, skills: SkillSet) -> RowPolicy:

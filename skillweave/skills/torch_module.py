@@ -210,6 +210,7 @@ def from_torch(
     every: int = 1,
     chunk: int | None = None,
     state: Any = None,
+    anew: Any = (),
     observation_space: Any = None,
     action_space: Any = None,
     learn: Literal[False] = False,
@@ -237,6 +238,7 @@ def from_torch(
     every: int = 1,
     chunk: int | None = None,
     state: Any = None,
+    anew: Any = (),
     observation_space: Any = None,
     action_space: Any = None,
     learn: bool = False,
@@ -269,6 +271,9 @@ def from_torch(
         chunk: the number of actions that are used of each output (n, H, ...).
         state: the shape of a recurrent state, None as the axis of the environments: (1, None, 64);
             or a list of shapes, for a tuple of tensors. It starts with zeros.
+        anew: what begins anew where the skill is called again at once: "state", "last_action",
+            "held" (of ``every`` and ``chunk``), or several. The rest goes on, clocks too; after
+            another skill's call all begins anew.
         observation_space: None: the environment's.
         action_space: None: the environment's.
         learn: the skill learns on from the module.
@@ -282,7 +287,7 @@ def from_torch(
         PolicyError: the file is not trusted, or holds no module; or the module cannot learn on.
         RunError: the file does not exist.
     """
-    mapping = mapping_of("from_torch()", sees, goal, acts, every, chunk, state)
+    mapping = mapping_of("from_torch()", sees, goal, acts, every, chunk, state, anew=anew)
     fitted(bool, learn, "from_torch(): learn")
     if learn and mapping != PolicyMapping():
         raise DeclarationError(
