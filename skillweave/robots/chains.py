@@ -77,25 +77,18 @@ class Listed(RowPolicy):
         return np.array([choice])
 
 
-class ChainPlayer:
-    """Plays calls one after another; a context manager, as it keeps an environment open.
+class OpenRobot:
+    """The environment of one robot at a time; a context manager, as it stays open.
 
     Args:
-        skills: with their policies.
-        aims: what a call of each is for.
         spec: of the environment, without what is drawn.
-        longest: the most steps of a call.
     """
 
-    def __init__(self, skills: SkillSet, aims: Sequence[Aim], spec: EnvSpec, longest: int) -> None:
-        self.aims = tuple(aims)
+    def __init__(self, spec: EnvSpec) -> None:
+        self.name = spec.name
         self.steps = 0
         """Steps so far."""
         self._spec = replace(spec, engine="sync")  # the only one whose resets take seeds
-        self._longest = longest
-        self._listed = Listed()
-        lengths = Lengths(*range(1, longest + 1))
-        self._policy = acting_policy(replace(skills, call_steps=lengths), self._listed)
         self._engine: Engine | None = None
         self._settings: dict[str, Any] | None = None
 
@@ -108,8 +101,43 @@ class ChainPlayer:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self._close()
+
+    def engine(self, robot: Robot) -> Engine:
+        """Return the robot's environment: the open one where its settings are the same."""
+        if self._engine is None or robot.settings != self._settings:
+            self._close()
+            spec = replace(self._spec, kwargs={**self._spec.kwargs, **robot.settings})
+            self._engine = make_engine(spec, 1)
+            self._settings = robot.settings
+        return self._engine
+
+    def _close(self) -> None:
         if self._engine is not None:
             self._engine.close()
+            self._engine = None
+
+
+class ChainPlayer:
+    """Plays calls one after another.
+
+    Args:
+        skills: with their policies.
+        aims: what a call of each is for.
+        where: the environment.
+        longest: the most steps of a call.
+    """
+
+    def __init__(
+        self, skills: SkillSet, aims: Sequence[Aim], where: OpenRobot, longest: int
+    ) -> None:
+        self.aims = tuple(aims)
+        self._where = where
+        self._longest = longest
+        self._listed = Listed()
+        lengths = Lengths(*range(1, longest + 1))
+        whole = replace(skills, call_steps=lengths, interruption=None)
+        self._policy = acting_policy(whole, self._listed)
 
     def play(self, robot: Robot, calls: Sequence[PlannedCall]) -> list[Outcome]:
         """Play calls from a fresh start of a robot, until one of them is not done.
@@ -119,19 +147,7 @@ class ChainPlayer:
         """
         seeds = Seeds(robot.seed) / "chain"
         with global_generators(seeds):
-            engine = self._open(robot)
-            return self._play(engine, robot, calls, seeds.numpy())
-
-    def _open(self, robot: Robot) -> Engine:
-        """Return the robot's environment: the open one where its settings are the same."""
-        if self._engine is None or robot.settings != self._settings:
-            if self._engine is not None:
-                self._engine.close()
-                self._engine = None
-            spec = replace(self._spec, kwargs={**self._spec.kwargs, **robot.settings})
-            self._engine = make_engine(spec, 1)
-            self._settings = robot.settings
-        return self._engine
+            return self._play(self._where.engine(robot), robot, calls, seeds.numpy())
 
     def _play(
         self, engine: Engine, robot: Robot, calls: Sequence[PlannedCall], rng: np.random.Generator
@@ -141,7 +157,7 @@ class ChainPlayer:
         found = list[Outcome]()
         one = _OpenCall(self.aims[calls[0].skill])
         for now in play(self._policy, episodes, rng=rng):
-            self.steps += 1
+            self._where.steps += 1
             call = calls[len(found)]
             if self._listed.refused:
                 found.append(Outcome(call.skill, 0, False, False, True, now.step.obs[0]))
@@ -153,7 +169,7 @@ class ChainPlayer:
             more = len(found) < len(calls)
             if now.step.truncated[0] and one.ok and (more or self._is_short(one, call, end)):
                 raise EnvError(
-                    f"{self._spec.name}: its time limit ended an episode after "
+                    f"{self._where.name}: its time limit ended an episode after "
                     f"{int(now.step.elapsed[0]):,} steps, before {len(calls)} calls were over: "
                     "give it a longer limit (max_episode_steps, for example), or shorter calls "
                     "(steps=, cut=)"

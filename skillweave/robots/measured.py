@@ -166,6 +166,7 @@ class MeasuredHandovers:
         played: environment steps in all.
         seconds: taken in all.
         stopped: Ctrl-C has ended it.
+        trial: the skills and robots, to try remedies on; None: it was not measured here.
     """
 
     skills: tuple[str, ...]
@@ -177,6 +178,7 @@ class MeasuredHandovers:
     played: int = 0
     seconds: float = 0.0
     stopped: bool = False
+    trial: Any = field(default=None, repr=False)
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:

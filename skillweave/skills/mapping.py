@@ -17,7 +17,7 @@ from skillweave._internal.messages import short
 from skillweave._internal.named import named
 from skillweave.errors import DeclarationError
 from skillweave.policies.mapped import LONGEST
-from skillweave.schema import Check, fitted, settings
+from skillweave.schema import Check, Count, fitted, settings
 
 # Values of fields
 
@@ -77,7 +77,6 @@ GoalValue = (
     | None
 )
 """The goal of a policy."""
-_Ramp = Annotated[int, Check(f"0 to {LONGEST:,} steps", lambda x: 0 <= x <= LONGEST)]
 _Steps = Annotated[int, Check(f"at least 1 and at most {LONGEST:,}", lambda x: 1 <= x <= LONGEST)]
 
 
@@ -212,7 +211,7 @@ class Acts:
     """The lowest and the highest output, before scaling."""
     rest: Numbers | None = None
     """The other numbers of the action, where ``to`` is a part of it: a number, or one for each."""
-    ramp: _Ramp = 0
+    ramp: Count = 0
     """The steps in which the action goes from the robot's last one to the policy's, in a call that
     follows another skill's; 0: none. The k-th of n steps has k/n of the policy's."""
 
