@@ -244,7 +244,7 @@ RANGES: dict[Any, str] = {
         "eval_every generations log_calls n_sampled_goal policy_delay population search_steps "
         "selector_steps size skill_steps start_calls steps target_update_interval train_freq"
     ),
-    Count: ("learning_starts"),
+    Count: ("learning_starts ramp"),
     Amount: (
         "action_repeat_steps batch_size imitation_steps n_step n_steps num_envs update_epochs"
     ),

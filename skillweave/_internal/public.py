@@ -75,7 +75,10 @@ PUBLIC = {
         "planning.planner": "Planner",
     },
     "skillweave.reporting": {"reporting.curves_figure": "plot_curves"},
-    "skillweave.robots": {"robots.measured": "Between ChainChance Entry MeasuredHandovers Pair"},
+    "skillweave.robots": {
+        "robots.measured": "Between ChainChance Entry MeasuredHandovers Pair",
+        "robots.remedies": "Effect Remedies Tried",
+    },
     "skillweave.types": {
         "export.write": "Export",
         "hierarchy.policy": "HierarchyPolicy",

@@ -223,10 +223,20 @@ class EpisodeProgress:
         episodes: the number of episodes.
         quiet: show nothing.
         name: the name of the evaluation, for the display.
+        unit: what is counted.
     """
 
-    def __init__(self, episodes: int, *, quiet: bool = False, name: str = "evaluation") -> None:
-        self._episodes = episodes
+    def __init__(
+        self,
+        episodes: int,
+        *,
+        quiet: bool = False,
+        name: str = "evaluation",
+        unit: str = "episodes",
+    ) -> None:
+        self.episodes = episodes
+        """The number of episodes; more may come to it."""
+        self._unit = unit
         self._quiet = quiet
         self._name = name
         self._over = self._steps = 0
@@ -265,14 +275,14 @@ class EpisodeProgress:
                 self._pause = PLAIN_PATIENCE
                 return
             self._pause = self._display.every
-        episodes = f"{self._over:,} of {self._episodes:,} episodes"
+        episodes = f"{self._over:,} of {self.episodes:,} {self._unit}"
         played = f"{self._steps:,} steps"
         taken = now - self._started
         if self._display is None:
             say(f"{self._name}: {episodes}, {played}")
             self._pause = max(PLAIN_PATIENCE, SPREAD * taken)
             return
-        share = self._over / self._episodes
+        share = self._over / self.episodes
         left = f"{_clock(taken / share - taken)} left" if share else ""
         self._display.put(Row(self._name, share, episodes, played, left=left))
         self._display.draw()

@@ -16,5 +16,10 @@ if TYPE_CHECKING:
         MeasuredHandovers as MeasuredHandovers,
         Pair as Pair,
     )
+    from skillweave.robots.remedies import (
+        Effect as Effect,
+        Remedies as Remedies,
+        Tried as Tried,
+    )
 else:
     __all__, __getattr__, __dir__ = lazy(__name__)

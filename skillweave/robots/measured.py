@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from math import comb
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,9 @@ from skillweave._internal.notebooks import table
 from skillweave.calls.handover import START, wilson
 from skillweave.errors import DeclarationError
 from skillweave.policies.core import Array
+from skillweave.robots.counts import exact_chance
+from skillweave.robots.remedies import Remedies, find_remedies
+from skillweave.schema import AtLeastOne, fitted
 
 SHOWN = 12
 """The most pairs in the list of a text."""
@@ -262,6 +264,42 @@ class MeasuredHandovers:
         chains.sort(key=lambda one: (-one.estimate, -one.interval[0]))
         return Between(_chance((after, skill), [(direct.done, direct.calls)]), tuple(chains))
 
+    @checked_names
+    def remedies(
+        self,
+        after: str,
+        skill: str,
+        *,
+        robots: int = 40,
+        instead: Mapping[str, Any] | None = None,
+        quiet: bool = False,
+    ) -> Remedies:
+        """Try remedies for a pair: choose one on some robots, and report it on others.
+
+        Tried are each other skill in between; cross-fades and ramps over an eighth and a quarter of
+        a call; and a first skill that is cut so much later. All are played on the same new robots,
+        beside the pair without a remedy. One that wins at least three robots more than it loses is
+        played on as many others, and where it is in force after other skills, too, there as well.
+        Ctrl-C ends it with what was tried.
+
+        Args:
+            after: the name of the skill before.
+            skill: of the one that fails after it.
+            robots: those of the choice; as many others are for the report.
+            instead: further remedies by name: policies in place of the second skill's, such as one
+                that enters its motion a second earlier.
+            quiet: no progress.
+
+        Raises:
+            DeclarationError: there is no such skill, or these handovers were not measured here.
+        """
+        self.pair(after, skill)
+        robots = fitted(AtLeastOne, robots, "robots")
+        if self.trial is None:
+            raise DeclarationError("remedies() needs the skills: call handovers() here first")
+        named = fitted(Mapping[str, Any], instead or {}, "instead")
+        return find_remedies(self.trial, after, skill, robots, named, quiet=quiet)
+
     def clearly_worse(self) -> list[Pair]:
         """Return the pairs that lose robots by more than chance, though there are many pairs."""
         tested = [pair for pair in self.pairs if pair.calls]
@@ -469,17 +507,6 @@ def _badness(pair: Pair) -> tuple[float, float, str, str]:
 
 def _range(values: Sequence[int]) -> tuple[int, int] | None:
     return (min(values), max(values)) if values else None
-
-
-def exact_chance(lost: int, won: int) -> float:
-    """Return how likely counts at least so unequal are where both are alike (McNemar's exact test).
-
-    Args:
-        lost, won: robots on which two treatments differ, by which of them is better.
-    """
-    n = lost + won
-    tail = sum(comb(n, k) for k in range(min(lost, won) + 1)) / 2**n
-    return float(min(1.0, 2 * tail))
 
 
 def _chance(skills: Sequence[str], counts: Sequence[tuple[int, int]]) -> ChainChance:

@@ -13,7 +13,7 @@ from skillweave.calls.handover import START
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.robots.chains import ChainPlayer, OpenRobot, Outcome, PlannedCall, Robot
 from skillweave.robots.measured import Entry, MeasuredHandovers
-from skillweave.robots.trial import Trial, check_repeats, make_trial
+from skillweave.robots.trial import RobotTrial, check_repeats, make_trial
 from skillweave.schema import AtLeastOne, fitted
 
 MOST = 60
@@ -113,7 +113,7 @@ def handovers(
 class _Plan:
     """Which calls are played on which robot, and what came out."""
 
-    def __init__(self, trial: Trial, player: ChainPlayer, calls: int) -> None:
+    def __init__(self, trial: RobotTrial, player: ChainPlayer, calls: int) -> None:
         self.entries: list[Entry] = []
         self.no_entry: dict[str, tuple[int, int]] = {}
         """By the name of a first skill: tries after which no other could enter, and all."""
@@ -134,8 +134,9 @@ class _Plan:
     ) -> None:
         """Play until each cell has its entries, or is tried too often."""
         robot = first
-        with EpisodeProgress(len(self._cells) * self._calls, quiet=quiet, name="calls") as shown:
+        with EpisodeProgress(1, quiet=quiet, name="handovers", unit="calls") as shown:
             while (wanted := self._wanted()) and not requested():
+                shown.episodes = sum(self._targets.values())
                 self._on_robot(where, robot, wanted, shown)
                 robot = next(more)
 
@@ -160,6 +161,7 @@ class _Plan:
                 self._tries[j, i] += 1
                 continue
             before = where.steps
+            counted = len(self.entries)
             found = self._play_pair(robot, j, i) if i >= 0 else None
             if i >= 0 and found is None:
                 fails.add(i)
@@ -167,7 +169,7 @@ class _Plan:
                 alone[j] = self._play_alone(robot, j)
             if found is not None:
                 self._compare((j, i), alone[j], found.counts)
-            shown.count(where.steps - before, 1)
+            shown.count(where.steps - before, len(self.entries) - counted)
             if requested():
                 return
 

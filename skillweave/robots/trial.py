@@ -34,7 +34,7 @@ class Ready(Skill):
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class RobotTrial:
     """Skills of one robot, what their calls are for, and how robots differ."""
 
     spec: EnvSpec
@@ -91,7 +91,7 @@ def make_trial(
     vary: Any,
     cut: Any,
     seed: Any,
-) -> Trial:
+) -> RobotTrial:
     """Return a trial of the arguments of ``handovers``."""
     variation = Variation({} if vary is None else vary)
     spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
@@ -101,7 +101,9 @@ def make_trial(
     ready = _skill_set(declared, skills)
     most = _steps_of(steps, [skill.name for skill in ready.skills])
     aims = aims_of(ready.skills, stays, done, follows)
-    return Trial(spec, ready, tuple(aims), tuple(most), tuple(_cuts(cut, most)), variation, seed)
+    return RobotTrial(
+        spec, ready, tuple(aims), tuple(most), tuple(_cuts(cut, most)), variation, seed
+    )
 
 
 def _skill_set(spec: EnvSpec, skills: Any) -> SkillSet:

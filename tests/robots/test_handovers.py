@@ -15,7 +15,8 @@ from robots.owner import plainly, policies, up
 
 import skillweave as sw
 from skillweave.errors import DeclarationError, EnvError, PolicyError, SkillError
-from skillweave.robots.measured import Entry, MeasuredHandovers, exact_chance
+from skillweave.robots.counts import exact_chance
+from skillweave.robots.measured import Entry, MeasuredHandovers
 from skillweave.robots.measuring import MOST
 from skillweave.toys.balancer import Balancer
 
