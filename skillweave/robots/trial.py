@@ -185,5 +185,5 @@ def check_repeats(player: ChainPlayer, robot: Robot, steps: int) -> None:
             f"reset(seed={robot.seed}) and the same skill came to another end when they were "
             "played again, so an entry cannot be compared with a fresh start of the same robot: "
             "let the environment draw all that is random from self.np_random, which reset(seed=) "
-            "seeds"
+            "seeds, and let no policy keep a state of its own (state=)"
         )
