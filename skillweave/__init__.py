@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from skillweave.hierarchy.settings import Apart as Apart, Guide as Guide, Selection as Selection
     from skillweave.networks.config import Network as Network
     from skillweave.policies.core import Step as Step
+    from skillweave.robots.inputs import inputs as inputs
     from skillweave.robots.measuring import handovers as handovers
     from skillweave.skills import (
         Reflex as Reflex,

@@ -31,6 +31,7 @@ SHIPPED: Mapping[str, Mapping[str, str]] = {
     "command": {
         "demo": "skillweave.demo.commands:DEMO",
         "handover": "skillweave.robots.commands:HANDOVER",
+        "inputs": "skillweave.robots.commands:INPUTS",
         "plan": "skillweave.planning.commands:PLAN",
         "report": "skillweave.html_report.commands:REPORT",
         "compare": "skillweave.html_report.commands:COMPARE",

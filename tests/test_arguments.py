@@ -57,7 +57,7 @@ INSIDE = {
     "Export", "LastCall", "Layout", "Net", "OptionsEnv", "ParameterGroup",
     "ParentSelection", "Policy", "Report",
     "Between", "Blame", "CallEnds", "CallLog", "Chain", "ChainChance", "Effect", "Entry",
-    "Forecast",
+    "Forecast", "InputPart", "InputSheet", "OutputLimits",
     "Handover", "MeasuredHandovers", "Pair", "PlannedRun", "Remedies", "Reported",
     "Tried",
     "Rollout", "Run", "Sample", "Seeds", "Skill", "SkillweaveError", "Step", "adam_",

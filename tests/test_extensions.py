@@ -93,7 +93,7 @@ LACKS = {
     "recipes": "command.demo",
     "demo": "command.demo",
     "compat": "command.import-agilerl",
-    "robots": "command.handover",
+    "robots": "command.handover command.inputs",
 }
 
 

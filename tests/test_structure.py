@@ -51,6 +51,7 @@ CORE = CENTRE | {"shipped", "api", "cli", "skillweave"}
 RETURNED = {
     ("api", "planning.planned_run"),
     ("api", "repair.repair_stage"),
+    ("skillweave", "robots.inputs"),
     ("skillweave", "robots.measuring"),
 }
 ROOMS: dict[str, set[str]] = {

@@ -19,6 +19,7 @@ PUBLIC = {
         "hierarchy.settings": "Apart Guide Selection",
         "networks.config": "Network",
         "policies.core": "Step",
+        "robots.inputs": "inputs",
         "robots.measuring": "handovers",
         "skills": "Reflex Residual Skill from_function from_onnx from_sb3 from_torch tree",
         "skills.automaton": "Automaton",
@@ -76,6 +77,7 @@ PUBLIC = {
     },
     "skillweave.reporting": {"reporting.curves_figure": "plot_curves"},
     "skillweave.robots": {
+        "robots.inputs": "InputPart InputSheet OutputLimits",
         "robots.measured": "Between ChainChance Entry MeasuredHandovers Pair",
         "robots.remedies": "Effect Remedies Tried",
     },

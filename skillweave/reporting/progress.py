@@ -264,6 +264,7 @@ class EpisodeProgress:
             return
         self._steps += steps
         self._over += over
+        self.episodes = max(self.episodes, self._over)
         now = time.monotonic()
         if now - self._shown < self._pause:
             return

@@ -9,6 +9,11 @@ from typing import TYPE_CHECKING
 from skillweave._internal.public import lazy
 
 if TYPE_CHECKING:
+    from skillweave.robots.inputs import (
+        InputPart as InputPart,
+        InputSheet as InputSheet,
+        OutputLimits as OutputLimits,
+    )
     from skillweave.robots.measured import (
         Between as Between,
         ChainChance as ChainChance,

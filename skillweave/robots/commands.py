@@ -1,4 +1,4 @@
-"""The command ``skillweave handover``.
+"""The commands ``skillweave handover`` and ``skillweave inputs``.
 
 Nothing here imports torch, as help reads it.
 """
@@ -28,4 +28,19 @@ class HandoverCommand(Output):
     """A JSON file for all entries."""
 
 
+@dataclass(frozen=True)
+class InputsCommand(Output):
+    """Show what ready policies are given as inputs, and which part of it is far off."""
+
+    file: Positional[str] = tyro.MISSING
+    """A Python file that defines env, and policy or skills (policies by name), perhaps vary."""
+    steps: int = 100
+    """The most steps of an episode."""
+    episodes: int = 10
+    """How many are played."""
+    seed: int = 0
+    """Of the episodes."""
+
+
+INPUTS = InputsCommand, "skillweave.robots.handover_command:show_inputs"
 HANDOVER = HandoverCommand, "skillweave.robots.handover_command:handover"

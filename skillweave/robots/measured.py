@@ -278,8 +278,9 @@ class MeasuredHandovers:
 
         Tried are each other skill in between; cross-fades and ramps over an eighth and a quarter of
         a call; and a first skill that is cut so much later. All are played on the same new robots,
-        beside the pair without a remedy. One that wins at least three robots more than it loses is
-        played on as many others, and where it is in force after other skills, too, there as well.
+        beside the pair without a remedy. The best, or a gentler one that is at most two robots
+        behind it, is played on as many others, if it wins at least three robots more than it loses;
+        and where it is in force after other skills, too, there as well.
         Ctrl-C ends it with what was tried.
 
         Args:

@@ -25,6 +25,8 @@ from skillweave.skills.skill_set import SkillSet
 
 GAIN = 3
 """The robots that a remedy has to win, less those that it loses, to be chosen."""
+CLOSE = 2
+"""Of remedies that are so few robots behind the best, the gentlest is chosen: more is chance."""
 SURE = 0.05
 """The chance at which a remedy is said to help."""
 SHARES = (8, 4)
@@ -94,7 +96,7 @@ class Remedies:
         skill: the one that fails after it.
         robots: those of the choice.
         without: of these, those on which the skill is done without a remedy.
-        tried: all remedies, the best first.
+        tried: all remedies, the chosen one first, then by their gain.
         effect: of the first of them, on other robots; None: no remedy gained enough to be chosen.
         elsewhere: where the remedy is in force after other skills, too: what it does there.
         stopped: Ctrl-C has ended it.
@@ -267,7 +269,7 @@ class _Search:
 
 
 def _tried(ways: Sequence[Way], rows: Sequence[Sequence[bool]]) -> list[Tried]:
-    """Return all ways but the first, which is no remedy; the best first."""
+    """Return all ways but the first, which is no remedy; the one to choose first."""
     done = np.array(rows, bool).reshape(len(rows), len(ways))
     plain = done[:, 0]
     found = [
@@ -276,7 +278,9 @@ def _tried(ways: Sequence[Way], rows: Sequence[Sequence[bool]]) -> list[Tried]:
         )
         for way, own in zip(ways[1:], done[:, 1:].T, strict=True)
     ]
-    return sorted(found, key=lambda one: -one.gain)  # of equals the one that was named first
+    most = max(one.gain for one in found)
+    close = [one for one in found if one.gain >= most - CLOSE]
+    return sorted(found, key=lambda one: (one is not close[0], -one.gain))
 
 
 def _effect(after: str, rows: Iterable[Sequence[bool]]) -> Effect:
@@ -297,7 +301,7 @@ def _ways(trial: RobotTrial, i: int, j: int, instead: Mapping[str, Any]) -> Iter
     skills = trial.skills
     policy = skills.policies[j]
     if space_of(skills.action_space).kind == "Box":
-        for steps in _lengths(trial.steps[j]):
+        for steps in reversed(_lengths(trial.steps[j])):
             how = f"fade = {{{after!r}: {steps}}} in the class of the skill {skill!r}"
             yield Way(f"cross-fade over {steps} steps", how, _faded(skills, j, after, steps))
         for steps in _lengths(trial.steps[j]) if isinstance(policy, MappedPolicy) else ():

@@ -33,6 +33,14 @@ class Ready(Skill):
         self.policy = policy
 
 
+def robots_of(variation: Variation, seed: int, first: int = 0) -> Iterator[Robot]:
+    """Yield the robots of a seed without end, from a number on."""
+    seeds = Seeds(seed) / "robots"
+    for number in count(first):
+        own = seeds / number
+        yield Robot(number, own.integer(), variation.draw((own / "settings").numpy()))
+
+
 @dataclass(frozen=True, eq=False)
 class RobotTrial:
     """Skills of one robot, what their calls are for, and how robots differ."""
@@ -54,11 +62,8 @@ class RobotTrial:
         return tuple(skill.name for skill in self.skills.skills)
 
     def robots(self, first: int = 0) -> Iterator[Robot]:
-        """Yield robots without end, from a number on."""
-        seeds = Seeds(self.seed) / "robots"
-        for number in count(first):
-            own = seeds / number
-            yield Robot(number, own.integer(), self.variation.draw((own / "settings").numpy()))
+        """Return robots without end, from a number on."""
+        return robots_of(self.variation, self.seed, first)
 
     def cut(self, robot: Robot, i: int) -> int:
         """Return the steps after which skill ``i`` is cut: on a robot always the same."""

@@ -166,6 +166,14 @@ class MappedPolicy(Functional, Foreign, Model):
         """Return whether the goal of a skill is an input of it."""
         return bool(self.mapping.goal_places)
 
+    def normalized(self) -> dict[str, tuple[Array, Array]]:
+        """Return means and deviations by which its model normalizes inputs, flat, by their names.
+
+        They are of the observations on which it was trained. An input without them is left out.
+        """
+        names = self.mapping.scaling  # of ``VecNormalize``, which is applied already
+        return {name: (np.zeros(1), np.ones(1)) for name in names}
+
     def with_goal(self, goal: Any) -> Self:
         """Return a copy with another goal: numbers, or a function of observations.
 

@@ -16,7 +16,7 @@ from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, shortened
 from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, RunError, needs_extra
-from skillweave.policies.core import RowPolicy
+from skillweave.policies.core import Array, RowPolicy
 from skillweave.policies.mapped import OnnxFile, fits_shape
 from skillweave.policies.sessions import open_session
 from skillweave.policies.spaces import space_of
@@ -138,6 +138,33 @@ class OnnxPolicy(MappedPolicy):
                 f"{self.output!r} is used: name the right one, output={self.output!r}"
             )
         return super().in_place
+
+    def normalized(self) -> dict[str, tuple[Array, Array]]:
+        """Return means and deviations that the graph subtracts from inputs, and divides by."""
+        with needs_extra("an ONNX file", "onnx"):
+            import onnx
+            import onnx.numpy_helper
+        graph = onnx.load_from_string(self.data).graph
+        known = {one.name: onnx.numpy_helper.to_array(one) for one in graph.initializer}
+        for node in graph.node:
+            if node.op_type == "Constant" and node.attribute[0].name == "value":
+                known[node.output[0]] = onnx.numpy_helper.to_array(node.attribute[0].t)
+        names = {name: name for name in self.free} if len(self.free) > 1 else {self.free[0]: ""}
+        found: dict[str, tuple[Array, Array]] = {}
+        centred: dict[str, tuple[str, Array]] = {}
+        for node in graph.node:
+            first, *more = node.input
+            second = known.get(more[0]) if more else None
+            if second is None or second.dtype.kind != "f":
+                continue
+            if node.op_type == "Sub" and first in names:
+                centred[node.output[0]] = names[first], second
+            elif node.op_type in ("Div", "Mul") and first in centred:
+                name, mean = centred[first]
+                with np.errstate(divide="ignore"):
+                    deviation = second if node.op_type == "Div" else 1.0 / second
+                found[name] = np.float64(mean).reshape(-1), np.float64(deviation).reshape(-1)
+        return super().normalized() | found
 
     def source(self) -> dict[str, Any]:
         """Return the file, the checksum of the copy that the run keeps, and the mapping."""

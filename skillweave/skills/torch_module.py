@@ -151,6 +151,25 @@ class TorchPolicy(MappedPolicy):
         arrays = [x.to(torch.float64).cpu().numpy() for x in after]
         return output.cpu().numpy(), rows_first(arrays, mapping.state, self._who)
 
+    def normalized(self) -> dict[str, tuple[Array, Array]]:
+        """Return the mean and deviation of a submodule that normalizes, as rsl_rl writes it.
+
+        It has the buffers ``_mean`` and ``_std``, and divides by the deviation and 0.01.
+        """
+        for part in self.module.modules():
+            buffers = dict(part.named_buffers(recurse=False))
+            if {"_mean", "_std"} <= buffers.keys():
+                mean, deviation = (
+                    buffers[k].cpu().numpy().astype(float) for k in ("_mean", "_std")
+                )
+                return {
+                    "": (
+                        mean.reshape(-1),
+                        deviation.reshape(-1) + float(getattr(part, "eps", 0.01)),
+                    )
+                }
+        return super().normalized()
+
     def source(self) -> dict[str, Any]:
         """Return the module's class, the checksum of its weights or its file, and the mapping."""
         return super().source() | {"name": self.label} | self.origin

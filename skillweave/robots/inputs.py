@@ -1,0 +1,561 @@
+"""``sw.inputs``: what a policy from elsewhere is shown, and which part of it is far off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import aligned, short
+from skillweave._internal.notebooks import table
+from skillweave._internal.seeding import Seeds, global_generators
+from skillweave.envs.make import EnvSpec
+from skillweave.errors import DeclarationError
+from skillweave.experience.play import SeededEpisodes, play
+from skillweave.policies.core import Array, Turn
+from skillweave.policies.mapped import Input, Mapped, Model, Outputs, Shapes
+from skillweave.robots.chains import OpenRobot, Robot
+from skillweave.robots.trial import robots_of
+from skillweave.robots.variation import Variation
+from skillweave.schema import AtLeastOne, fitted
+from skillweave.skills.mapped import MappedPolicy
+from skillweave.skills.ready import as_policy
+
+EARLY = 10
+"""The first steps of an episode: what is wrong later may follow from what was wrong then."""
+FAR = 4.0
+"""A number is far if it is so many deviations of the training from its mean there."""
+SHIFTED = 1.5
+"""It is also far if it begins, on average, so many deviations from its mean."""
+SMALL = 0.4
+"""A part is too small if it varies at most so much as the other parts do, in deviations."""
+MOVES = 0.1
+"""The least that the others have to vary, in deviations, to say so."""
+FEW_PARTS = 3
+"""The fewest parts of which one is compared with the others."""
+PULSE = 3
+"""The steps in which an output is changed, to see which number follows it."""
+OTHERS = 0.2
+"""The share of outputs that other numbers follow, from which the order is said to be wrong."""
+LEAST_OTHERS = 2
+"""The fewest of these outputs."""
+OF_THEIR_OWN = 0.8
+"""The share of outputs that a number of its own has to follow, to say so."""
+UNIT = 0.02
+"""A part is a direction if its length differs so little from 1."""
+TURNS, ELSEWHERE = 0.8, 0.5
+"""The share of a direction's motion that a turn explains: in some frame, at most in this one."""
+AGAINST = 0.6
+"""The share of outputs against which their numbers move, from which the sign is."""
+MOST_PULSES = 64
+"""The most outputs that are tried."""
+AT_LIMIT = 0.2
+"""The share of steps at the limit of the action from which an output is named."""
+
+
+@dataclass(frozen=True)
+class InputPart:
+    """A part of what a policy is shown, as its model gets it: after offset, scale and clip.
+
+    Attributes:
+        name: its source: a key of the observation, ``Goal()``, ``LastAction()``, a function.
+        numbers: how many.
+        reset: (numbers,) the mean at the starts of episodes.
+        low: (numbers,) the lowest in play.
+        high: (numbers,) the highest.
+        mean: (numbers,) of the training, that the model carries; None: it carries none.
+        deviation: (numbers,) the same.
+        early: (numbers,) the root mean square of the first steps, in these deviations from that
+            mean; None: unknown.
+        spread: (numbers,) the standard deviation in play, in deviations of the training; None.
+        why: what is far off, in words; empty: nothing is.
+    """
+
+    name: str
+    numbers: int
+    reset: Array
+    low: Array
+    high: Array
+    mean: Array | None = None
+    deviation: Array | None = None
+    early: Array | None = None
+    spread: Array | None = None
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class OutputLimits:
+    """The actions of a policy beside the limits of the environment's.
+
+    Attributes:
+        low: the lowest of each number of the flat action in play.
+        high: the highest.
+        at_limit: the share of steps in which each is at a limit; of what the policy writes.
+    """
+
+    low: Array
+    high: Array
+    at_limit: Array
+
+
+@dataclass(frozen=True)
+class InputSheet:
+    """Every part of what a policy is shown, and which are far off."""
+
+    name: str
+    """The policy's."""
+    parts: tuple[InputPart, ...]
+    """In the order of the inputs."""
+    outputs: OutputLimits | None
+    """None: actions are choices."""
+    steps: float
+    """The mean length of the episodes, which end where the environment ends them."""
+    asked: int
+    """The most steps of an episode."""
+
+    @property
+    def far(self) -> tuple[InputPart, ...]:
+        """The parts that are far off, the farthest first."""
+        found = [part for part in self.parts if part.why]
+        return tuple(sorted(found, key=lambda part: -_most(part.early)))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as plain JSON."""
+
+        def plain(value: Any) -> Any:
+            return value.tolist() if isinstance(value, np.ndarray) else value
+
+        outputs = self.outputs
+        return {
+            "policy": self.name,
+            "steps": self.steps,
+            "asked": self.asked,
+            "parts": [{k: plain(v) for k, v in vars(part).items()} for part in self.parts],
+            "far": [part.name for part in self.far],
+            "outputs": None if outputs is None else {k: plain(v) for k, v in vars(outputs).items()},
+        }
+
+    def sentences(self) -> list[str]:
+        """Return what is far off, and what is at the limits."""
+        found = [f"{part.name}: {part.why}" for part in self.far]
+        if self.outputs is not None:
+            often = np.flatnonzero(self.outputs.at_limit > AT_LIMIT)
+            if len(often):
+                found.append(
+                    f"{len(often)} of {len(self.outputs.low)} numbers of the action are at its "
+                    f"limit in more than {AT_LIMIT:.0%} of the steps: {short(often.tolist())}. "
+                    "Look at the scale of acts"
+                )
+        if all(part.mean is None for part in self.parts):
+            found.append(
+                "The model carries no mean and deviation of its inputs, so values are not compared"
+            )
+        if self.steps < self.asked:
+            found.append(f"Episodes end after {self.steps:.0f} of {self.asked} steps on average")
+        return found
+
+    def __str__(self) -> str:
+        return "\n\n".join([aligned([list(_HEAD), *self._rows()], left=1), *self.sentences()])
+
+    def _repr_html_(self) -> str:
+        notes = table((), [[sentence] for sentence in self.sentences()])
+        return f"{table(_HEAD, self._rows())}{notes}"
+
+    def _rows(self) -> list[list[str]]:
+        return [
+            [
+                part.name,
+                str(part.numbers),
+                _span(part.reset, part.reset),
+                _span(part.low, part.high),
+                "-" if part.mean is None else _span(part.mean, part.mean),
+                "-" if part.deviation is None else _span(part.deviation, part.deviation),
+                "-" if part.early is None else f"{_most(part.early):.1f}",
+                "far off" if part.why else "",
+            ]
+            for part in self.parts
+        ]
+
+
+_HEAD = (
+    "part", "numbers", "at reset", "in play", "mean in training", "deviation", "far by", "",
+)  # fmt: skip
+
+
+def _most(values: Array | None) -> float:
+    return 0.0 if values is None else float(values.max(initial=0.0))
+
+
+def _span(low: Array, high: Array) -> str:
+    first, last = f"{low.min():.3g}", f"{high.max():.3g}"
+    return first if first == last else f"{first} to {last}"
+
+
+@checked_names
+def inputs(
+    policy: Any,
+    env: Any,
+    *,
+    steps: int = 100,
+    episodes: int = 10,
+    vary: Mapping[str, Any] | None = None,
+    seed: int = 0,
+) -> InputSheet:
+    """Show every part of what a policy from elsewhere is given, and name those that are far off.
+
+    The policy plays, and its inputs are compared with the mean and deviation that its model carries
+    from training, where it has them: a graph that begins with Sub and Div, rsl_rl's normalization,
+    Stable-Baselines3's ``VecNormalize``. A part is far off if a number is more than four deviations
+    from its mean in the first ten steps, if it begins 1.5 deviations from it on average, or if the
+    part varies less than 0.4 times as much as the others do. Each output is also changed for a
+    moment: a part with a number for each output is far off if other numbers follow the outputs, or
+    move against them. So is a gyro that does not turn as gravity does.
+
+    Args:
+        policy: one with ``sees``, of ``from_onnx``, ``from_torch``, ``from_function`` or
+            ``from_sb3``, or the path of an ONNX file.
+        env: an ``EnvSpec``, a Gymnasium id, or a function that makes an environment.
+        steps: the most steps of an episode.
+        episodes: how many are played.
+        vary: keywords of the environment that are drawn for each episode; see ``handovers``.
+        seed: of the episodes.
+
+    Raises:
+        DeclarationError: an argument is wrong, or the policy declares no inputs.
+        PolicyError: it does not fit the environment.
+        EnvError: the environment cannot be made.
+    """
+    steps, episodes = fitted(AtLeastOne, steps, "steps"), fitted(AtLeastOne, episodes, "episodes")
+    found = as_policy(policy, "inputs(): policy")
+    if not isinstance(found, MappedPolicy):
+        raise DeclarationError(
+            f"inputs() looks at policies from elsewhere, not at {short(found)}: give one of "
+            "from_onnx, from_torch, from_function or from_sb3"
+        )
+    variation = Variation({} if vary is None else vary)
+    robots = robots_of(variation, fitted(int, seed, "seed"))
+    first = next(robots)
+    spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
+    spaces = EnvSpec(spec.env, {**spec.kwargs, **first.settings}, spec.wrappers).spaces
+    bound = found.bind(spaces.observation, spaces.action, "inputs()")
+    seen = _Seen(bound)
+    with OpenRobot(spec) as where:
+        for number, robot in enumerate([first, *(next(robots) for _ in range(episodes - 1))]):
+            seen.play(where, robot, steps)
+            if number == 0:
+                moved = _follows(seen, where, robot)
+    return seen.sheet(bound, _turns(seen) | moved, steps)
+
+
+class _Shown(Model):
+    """A model that keeps what it is shown, and whose outputs may be changed for a moment."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.inputs: list[dict[str, Array]] = []
+        self.outputs: list[Array] = []
+        self.pulse: tuple[int, float] | None = None
+        """The place of an output, and what is added to it in the first steps."""
+
+    @property
+    def expected(self) -> Shapes:
+        """The model's."""
+        return self.model.expected
+
+    @property
+    def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:
+        """The model's."""
+        return self.model.states
+
+    def call(
+        self, inputs: dict[str, Array], state: tuple[Array, ...], turn: Turn
+    ) -> tuple[Any, Sequence[Array]]:
+        """Call the model."""
+        self.inputs.append({name: np.array(x) for name, x in inputs.items()})
+        output, after = self.model.call(inputs, state, turn)
+        if self.pulse is not None and len(self.inputs) <= PULSE:
+            place, size = self.pulse
+            output = np.array(output, np.float64)
+            flat = output.reshape(len(output), -1)
+            flat[:, place] += size
+        self.outputs.append(np.asarray(output, np.float64).reshape(-1))
+        return output, after
+
+
+class _Seen:
+    """What a policy is shown in episodes, and what it does."""
+
+    def __init__(self, policy: MappedPolicy) -> None:
+        acting = policy.in_place
+        assert isinstance(acting, Mapped)
+        self.model = _Shown(acting.model)
+        self.acting = replace(acting, model=self.model, warn=None)
+        self.columns = list(_columns(acting.inputs, policy.observation_space))
+        """By part: the input, its name, and the places in the flat input."""
+        self.episodes: list[Array] = []
+        """(T, K) each, what was shown."""
+        self.outputs: list[Array] = []
+        self.actions: list[Array] = []
+
+    def play(self, where: OpenRobot, robot: Robot, steps: int, keep: bool = True) -> Array:
+        """Play an episode; return what was shown, (T, K)."""
+        self.model.inputs.clear()
+        self.model.outputs.clear()
+        seeds = Seeds(robot.seed) / "chain"
+        with global_generators(seeds):
+            episodes = SeededEpisodes(where.engine(robot), [robot.seed], steps)
+            for now in play(self.acting, episodes, rng=seeds.numpy()):
+                if keep:
+                    self.actions.append(np.array(now.step.action[0]))
+        shown = np.array([_flat(one, self.columns) for one in self.model.inputs])
+        if keep:
+            self.episodes.append(shown)
+            self.outputs.append(np.array(self.model.outputs))
+        return shown
+
+    def sheet(self, policy: MappedPolicy, moved: Mapping[int, str], steps: int) -> InputSheet:
+        """Return the sheet of what was seen.
+
+        Args:
+            moved: by the number of a part, what is wrong with the order or the sign of its numbers.
+        """
+        every = np.concatenate(self.episodes)
+        early = np.concatenate([one[:EARLY] for one in self.episodes])
+        reset = np.array([one[0] for one in self.episodes]).mean(0)
+        inside = policy.normalized()
+        parts, first = [], 0
+        for name, source, places in self.columns:
+            mine = slice(first, first + len(places))
+            first += len(places)
+            known = inside.get(name)
+            part = InputPart(
+                source, len(places), reset[mine], every[:, mine].min(0), every[:, mine].max(0)
+            )
+            if known is not None and len(known[0]) in (1, self._width(name)):
+                mean, deviation = (_at(x, places) for x in known)
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    part = replace(
+                        part,
+                        mean=mean,
+                        deviation=deviation,
+                        early=np.sqrt((((early[:, mine] - mean) / deviation) ** 2).mean(0)),
+                        spread=every[:, mine].std(0) / deviation,
+                    )
+            parts.append(part)
+        parts = _named(parts, moved)
+        lasted = float(np.mean([len(one) for one in self.episodes])) * self.acting.period
+        limits = _limits(np.array(self.actions), self.acting.outputs)
+        return InputSheet(policy.name, tuple(parts), limits, min(lasted, float(steps)), steps)
+
+    def _width(self, name: str) -> int:
+        return sum(len(places) for one, _, places in self.columns if one == name)
+
+
+def _columns(
+    inputs: Mapping[str, Input] | None, observation_space: Any
+) -> Iterator[tuple[str, str, Array]]:
+    """Yield the input, the name and the places of each part."""
+    if inputs is None:
+        size = math.prod(observation_space.shape or (1,))
+        yield "", "the observation", np.arange(size)
+        return
+    for name, one in inputs.items():
+        first = 0
+        for take in one.takes:
+            yield name, take.name, np.arange(first, first + take.size)
+            first += take.size
+
+
+def _flat(shown: Mapping[str, Array], columns: Sequence[tuple[str, str, Array]]) -> Array:
+    """Return the numbers of one environment, in the order of the parts."""
+    return np.concatenate(
+        [np.float64(shown[name][0]).reshape(-1)[places] for name, _, places in columns]
+    )
+
+
+def _at(values: Array, places: Array) -> Array:
+    return np.broadcast_to(values, len(places)) if len(values) == 1 else values[places]
+
+
+def _named(parts: Sequence[InputPart], moved: Mapping[int, str]) -> list[InputPart]:
+    """Return the parts with what is far off about them."""
+    far = [_most(part.early) for part in parts]
+    shifts = [_most(_shift(part)) for part in parts]
+    found = []
+    for k, part in enumerate(parts):
+        why = moved.get(k, "")
+        if far[k] > FAR and far[k] >= max(far) / 2:
+            assert part.early is not None
+            why = _off(part, int(part.early.argmax()))
+        elif max(far) <= FAR and not why:
+            shift = _shift(part)
+            if shift is not None and shifts[k] > SHIFTED:
+                why = _off(part, int(shift.argmax()))
+            elif max(shifts) <= SHIFTED and (times := _times_smaller(parts, k)):
+                why = f"it varies {times:.0f} times less than the other parts do: look at its scale"
+        found.append(replace(part, why=why))
+    return found
+
+
+def _shift(part: InputPart) -> Array | None:
+    """Return how far numbers begin from their mean in training, in deviations; None: unknown.
+
+    A goal is what the user wants, and the last action is 0 at the start.
+    """
+    if part.mean is None or part.name in ("Goal()", "LastAction()"):
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.abs(part.reset - part.mean) / part.deviation)
+
+
+def _off(part: InputPart, place: int) -> str:
+    """Return a sentence on a number that is far from its mean in training."""
+    assert part.mean is not None
+    return (
+        f"its number {place} is {part.reset[place]:.3g} at reset, and the model was trained on "
+        f"{part.mean[place]:.3g} +- {_deviation(part, place):.3g}: look at its place among the "
+        "inputs, its sign, offset and scale, and at how the robot begins"
+    )
+
+
+def _deviation(part: InputPart, place: int) -> float:
+    assert part.deviation is not None
+    return float(part.deviation[place])
+
+
+def _times_smaller(parts: Sequence[InputPart], k: int) -> float:
+    """Return how many times less a part varies than the others, in deviations; 0: it does not."""
+    moving = {
+        i: (float(np.median(part.early)), float(np.median(part.spread)))
+        for i, part in enumerate(parts)
+        if part.early is not None and part.spread is not None and part.name != "Goal()"
+    }
+    if k not in moving or len(moving) < FEW_PARTS:
+        return 0.0
+    ratios = []
+    for which in (0, 1):
+        others = float(np.median([pair[which] for i, pair in moving.items() if i != k]))
+        ratios.append(moving[k][which] / others if others > MOVES else 1.0)
+    most = max(ratios)
+    return 1 / max(most, 1e-9) if most < SMALL else 0.0
+
+
+def _follows(seen: _Seen, where: OpenRobot, robot: Robot) -> dict[int, str]:
+    """Return, by part, what is wrong with its order or its sign: which number follows an output.
+
+    Each output is changed in the first steps of the same episode. Of a part with as many numbers
+    as there are outputs, the one of the same place moves most, where the part is of the joints.
+    """
+    outputs = seen.acting.outputs
+    count = outputs.count
+    same = {k: places for k, (_, name, places) in enumerate(seen.columns) if len(places) == count}
+    same = {k: x for k, x in same.items() if seen.columns[k][1] not in ("LastAction()", "Goal()")}
+    period, chunk = seen.acting.period, seen.acting.chunk
+    if count < 2 or count > MOST_PULSES or not same or period > 1 or chunk is not None:
+        return {}
+    sizes = np.maximum(seen.outputs[0].std(0), 0.1)
+    length = PULSE + 2
+    plain = seen.play(where, robot, length, keep=False)
+    starts = np.cumsum([0, *(len(places) for _, _, places in seen.columns)])
+    direct = {k: np.zeros((count, count)) for k in same}
+    for place in range(count):
+        seen.model.pulse = place, float(sizes[place])
+        shown = seen.play(where, robot, length, keep=False)
+        seen.model.pulse = None
+        if len(shown) != len(plain):
+            return {}
+        for k in same:
+            mine = slice(starts[k], starts[k] + count)
+            direct[k][place] = (shown - plain)[1:, mine].sum(0)
+    scale = np.ones(count) if outputs.scale is None else np.broadcast_to(outputs.scale, count)
+    return {k: why for k in same if (why := _order(direct[k], np.sign(scale)))}
+
+
+def _order(moved: Array, sign: Array) -> str:
+    """Return what is wrong with numbers (K,) that move by ``moved`` (K, K) where outputs do."""
+    count = len(moved)
+    size = np.abs(moved)
+    if not (size.max(1) > 0).all():
+        return ""
+    follows = size.argmax(1)
+    other = np.flatnonzero(follows != np.arange(count))
+    own = len(set(follows.tolist())) >= OF_THEIR_OWN * count
+    if own and len(other) >= max(LEAST_OTHERS, OTHERS * count):
+        first = int(other[0])
+        return (
+            f"its numbers follow the outputs in another order, {len(other)} of {count}: output "
+            f"{first} moves its number {int(follows[first])}"
+        )
+    against = np.diag(moved) * sign < 0
+    if len(other) < max(LEAST_OTHERS, OTHERS * count) and against.mean() > AGAINST:
+        return f"{int(against.sum())} of its {count} numbers move against the outputs: its sign"
+    return ""
+
+
+def _turns(seen: _Seen) -> dict[int, str]:
+    """Return, by part, that a gyro is in another frame than a direction, or has another sign.
+
+    A direction b (3,), gravity for example, that is seen in a body's frame turns by
+    Δb = c b × w, where w (3,) is the body's angular velocity in the same frame.
+    """
+    starts = np.cumsum([0, *(len(places) for _, _, places in seen.columns)])
+    threes = [k for k, (_, _, places) in enumerate(seen.columns) if len(places) == 3]
+    found = dict[int, str]()
+    for k in threes:
+        b = [one[:, starts[k] : starts[k] + 3] for one in seen.episodes]
+        if any(abs(np.linalg.norm(one, axis=1) - 1).max() > UNIT for one in b):
+            continue
+        moved = np.concatenate([np.diff(one, axis=0) for one in b])
+        middle = np.concatenate([(one[1:] + one[:-1]) / 2 for one in b])
+        if not len(moved) or not moved.any():
+            continue
+        for other in threes:
+            if other == k or seen.columns[other][1] in ("Goal()", "LastAction()"):
+                continue
+            w = [one[:, starts[other] : starts[other] + 3] for one in seen.episodes]
+            w_middle = np.concatenate([(one[1:] + one[:-1]) / 2 for one in w])
+            here, factor, anywhere = _explained(moved, middle, w_middle)
+            name = seen.columns[k][1]
+            if anywhere > TURNS and here > TURNS and factor < 0:
+                found[other] = f"it turns against {name}: its sign"
+            elif anywhere > TURNS and here < ELSEWHERE:
+                found[other] = f"it does not turn as {name} does: it is in another frame"
+    return found
+
+
+def _explained(moved: Array, b: Array, w: Array) -> tuple[float, float, float]:
+    """Return how well ``moved`` is c b × w, this c, and how well it is b × (M w) for any M (3, 3).
+
+    Args:
+        moved, b, w: (T, 3).
+    """
+    total = float((moved**2).sum())
+    cross = np.cross(b, w)
+    size = float((cross**2).sum())
+    factor = float((moved * cross).sum()) / size if size > 0 else 0.0
+    here = 1 - float(((moved - factor * cross) ** 2).sum()) / total
+    # Each column of M and each number of w has its own cross product with b.
+    basis = [np.cross(b, axis) * w[:, [i]] for axis in np.eye(3) for i in range(3)]
+    design = np.stack([one.reshape(-1) for one in basis], axis=1)
+    solved, *_ = np.linalg.lstsq(design, moved.reshape(-1), rcond=None)
+    left = moved.reshape(-1) - design @ solved
+    return here, factor, 1 - float((left**2).sum()) / total
+
+
+def _limits(actions: Array, outputs: Outputs) -> OutputLimits | None:
+    """Return actions (T, …) beside the limits of their space; None: they are choices."""
+    space = outputs.space
+    if space.kind != "Box":
+        return None
+    flat = actions.reshape(len(actions), -1).astype(np.float64)
+    low, high = (
+        np.broadcast_to(bound, space.shape).reshape(-1).astype(np.float64) for bound in space.bounds
+    )
+    at = ((flat <= low) | (flat >= high)).mean(0)
+    if outputs.to is not None:  # the others rest where they are put
+        at[np.setdiff1d(np.arange(len(at)), outputs.to)] = 0.0
+    return OutputLimits(flat.min(0), flat.max(0), at)
