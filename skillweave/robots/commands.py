@@ -25,7 +25,7 @@ class HandoverCommand(Output):
     seed: int | None = None
     """Of robots and cuts; default: the file's, or 0."""
     out: MaybeOut = None
-    """A JSON file for all entries."""
+    """A file: .json for all entries, .html for a page, .svg for the matrix."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from skillweave.cli.output import Result
 from skillweave.errors import DeclarationError
 from skillweave.robots.commands import HandoverCommand, InputsCommand
 from skillweave.robots.inputs import inputs
+from skillweave.robots.measured import check_suffix
 from skillweave.robots.measuring import handovers
 
 NAMES = tuple(name for name in inspect.signature(handovers).parameters if name != "quiet")
@@ -22,6 +23,8 @@ NEEDED = ("env", "skills", "steps")
 
 def handover(command: HandoverCommand) -> Result:
     """Carry out ``skillweave handover``: play the skills that a file defines."""
+    if command.out is not None:
+        check_suffix(command.out)  # before anything is played
     defined = _defined(command.file)
     given: dict[str, Any] = {name: defined[name] for name in NAMES if name in defined}
     if missing := [name for name in NEEDED if name not in given]:
@@ -36,7 +39,7 @@ def handover(command: HandoverCommand) -> Result:
     found = handovers(env, skills, **given, quiet=command.quiet)
     text = str(found)
     if command.out is not None:
-        text += f"\n\nall entries: {shown_path(found.save(command.out))}"
+        text += f"\n\nwritten: {shown_path(found.save(command.out))}"
     return {"file": command.file, **found.to_json()}, text
 
 

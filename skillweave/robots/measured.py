@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -17,10 +17,12 @@ from skillweave._internal.messages import aligned, as_path, short, suggest
 from skillweave._internal.notebooks import table
 from skillweave.calls.handover import START, wilson
 from skillweave.errors import DeclarationError
-from skillweave.policies.core import Array
+from skillweave.policies.core import Array, Step
 from skillweave.robots.counts import exact_chance
+from skillweave.robots.drawing import matrix_svg, page
 from skillweave.robots.remedies import Remedies, find_remedies
 from skillweave.schema import AtLeastOne, fitted
+from skillweave.skills.skill_set import skills_below
 
 SHOWN = 12
 """The most pairs in the list of a text."""
@@ -28,6 +30,10 @@ CLEAR = 0.05
 """The chance that any pair is called clearly worse where none is."""
 DRAWS = 4000
 """Draws of the shares in a chain, for its interval."""
+REPAIRED = 2_000_000
+"""The number of the first robot on which repaired skills are measured."""
+SUFFIXES = (".json", ".html", ".svg")
+"""Of files that can be written."""
 FEW = 3
 """The fewest robots of which something is said about cuts."""
 
@@ -169,6 +175,7 @@ class MeasuredHandovers:
         seconds: taken in all.
         stopped: Ctrl-C has ended it.
         trial: the skills and robots, to try remedies on; None: it was not measured here.
+        run: of ``repair``, with the repaired policy, ``run.policy``; None: nothing was repaired.
     """
 
     skills: tuple[str, ...]
@@ -181,6 +188,7 @@ class MeasuredHandovers:
     seconds: float = 0.0
     stopped: bool = False
     trial: Any = field(default=None, repr=False)
+    run: Any = field(default=None, repr=False)
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
@@ -301,6 +309,53 @@ class MeasuredHandovers:
         named = fitted(Mapping[str, Any], instead or {}, "instead")
         return find_remedies(self.trial, after, skill, robots, named, quiet=quiet)
 
+    @checked_names
+    def repair(
+        self,
+        skill: str,
+        *,
+        after: str,
+        reward: Callable[[Step], Any],
+        scale: Any = 0.5,
+        steps: int = 60_000,
+        calls: int = 60,
+        run_dir: str | Path | None = None,
+        seed: int = 0,
+        quiet: bool = False,
+    ) -> MeasuredHandovers:
+        """Let a skill learn a correction in calls that follow another one, and measure all again.
+
+        A ``Residual`` of its policy learns by ``Run.repair``, on robots that vary as these do. It
+        is kept if the pair is clearly better and no other pair clearly worse. The handovers that
+        are returned are of other robots; their ``run`` has the repaired policy.
+
+        Args:
+            skill: the name of the skill that fails.
+            after: of the one after which it does.
+            reward: a function of a ``Step`` that returns (n,) numbers: what it is to maximise.
+            scale: the largest correction, as of ``Residual``.
+            steps: of training.
+            calls: of the pair, before and after; see ``Run.repair``.
+            run_dir: a new directory; None: the next numbers in ``runs/``.
+            seed: of all that is random.
+            quiet: no progress.
+
+        Raises:
+            DeclarationError: an argument is wrong, these handovers were not measured here, or the
+                pair needs no repair.
+        """
+        from skillweave.robots.learning_on import learn_on
+        from skillweave.robots.measuring import measure
+
+        self.pair(after, skill)
+        if self.trial is None:
+            raise DeclarationError("repair() needs the skills: call handovers() here first")
+        steps, calls = fitted(AtLeastOne, steps, "steps"), fitted(AtLeastOne, calls, "calls")
+        how = steps, calls, run_dir, seed
+        run = learn_on(self.trial, skill, after, reward, scale, *how, quiet=quiet)
+        again = replace(self.trial, skills=skills_below(run.policy))
+        return replace(measure(again, self.calls, quiet=quiet, first=REPAIRED), run=run)
+
     def clearly_worse(self) -> list[Pair]:
         """Return the pairs that lose robots by more than chance, though there are many pairs."""
         tested = [pair for pair in self.pairs if pair.calls]
@@ -331,13 +386,23 @@ class MeasuredHandovers:
 
     @checked_names
     def save(self, path: str | Path) -> Path:
-        """Write it as a JSON file, and return its path.
+        """Write it as a file, and return its path.
 
         Args:
-            path: the file.
+            path: ``.json`` for all entries, ``.html`` for a page, ``.svg`` for the matrix alone.
+
+        Raises:
+            DeclarationError: it ends otherwise.
         """
         path = as_path(path, "path")
-        path.write_text(json.dumps(self.to_json(), indent=1) + "\n", encoding="utf-8")
+        check_suffix(path)
+        if path.suffix == ".json":
+            content = json.dumps(self.to_json(), indent=1) + "\n"
+        elif path.suffix == ".svg":
+            content = self._picture()
+        else:
+            content = page(self._title(), self._picture(), self._list(), self.sentences())
+        path.write_text(content, encoding="utf-8")
         return path
 
     def __str__(self) -> str:
@@ -348,10 +413,22 @@ class MeasuredHandovers:
         return "\n\n".join(part for part in parts if part)
 
     def _repr_html_(self) -> str:
-        head, *rows = self._matrix()
-        worst = [*_HEAD], [_pair_row(pair) for pair in self._shown()]
-        lists = table(*worst) if worst[1] else ""
-        return f"{table(head, rows)}{lists}{table((), [[s] for s in self.sentences()])}"
+        return f"{self._picture()}{self._list()}{table((), [[s] for s in self.sentences()])}"
+
+    def _list(self) -> str:
+        """Return the pairs that are listed, as a table in HTML."""
+        rows = [_pair_row(pair) for pair in self._shown()]
+        return str(table(_HEAD, rows)) if rows else ""
+
+    def _picture(self) -> str:
+        """Return the matrix as SVG."""
+
+        def count(after: str, skill: str) -> tuple[int, int] | None:
+            some = self._of(after, skill)
+            return None if after == skill else (sum(entry.counts for entry in some), len(some))
+
+        rows = [[count(after, name) for name in self.skills] for after in (START, *self.skills)]
+        return matrix_svg(self.skills, rows)
 
     def sentences(self) -> list[str]:
         """Return what else is to be known: how it fails, what is missing, what was varied."""
@@ -483,6 +560,12 @@ class MeasuredHandovers:
             _range([entry.cut for entry in done]),
             int(np.median(falls)) if falls else None,
         )
+
+
+def check_suffix(path: Path) -> None:
+    """Raise a DeclarationError where handovers are not written as a file of this suffix."""
+    if path.suffix not in SUFFIXES:
+        raise DeclarationError(f"{path} must end in one of {', '.join(SUFFIXES)}")
 
 
 _HEAD = ("pair", "done", "fresh start, same robots", "lost", "won", "chance alike")

@@ -81,17 +81,26 @@ def handovers(
     """
     calls = fitted(AtLeastOne, calls, "calls")
     trial = make_trial(env, skills, steps, stays, done, follows, vary, cut, seed)
-    robots = trial.robots()
-    first = next(robots)
+    return measure(trial, calls, quiet=quiet)
+
+
+def measure(trial: RobotTrial, calls: int, *, quiet: bool, first: int = 0) -> MeasuredHandovers:
+    """Return the handovers of a trial; see ``handovers``.
+
+    Args:
+        first: the number of the first robot.
+    """
+    robots = trial.robots(first)
+    robot = next(robots)
     with OpenRobot(trial.spec) as where:
         player = trial.player(where)
-        check_repeats(player, first, trial.steps[0])
+        check_repeats(player, robot, trial.steps[0])
         plan = _Plan(trial, player, calls)
         started = time.monotonic()
         stopped = False
         try:
             with deferred("after this call"):
-                plan.measure(where, first, robots, quiet=quiet)
+                plan.measure(where, robot, robots, quiet=quiet)
         except KeyboardInterrupt:
             stopped = True
             notice("handovers() was stopped: the table has what was measured until then")

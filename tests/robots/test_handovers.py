@@ -7,6 +7,7 @@ import os
 import signal
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import gymnasium as gym
 import numpy as np
@@ -239,7 +240,13 @@ def test_it_is_written_as_json_and_shown_in_a_notebook(
     assert content["pairs"][0]["skill"] == "wave"
     assert content["entries"][0]["vary.latency"] in (0, 1)
     assert len(content["entries"]) == len(found.entries)
-    assert "<table>" in found._repr_html_()
+    page = found.save(tmp_path / "found.html").read_text()
+    assert page.count("60 of 60") >= 1
+    assert "0 of 60" in found.save(tmp_path / "found.svg").read_text()
+    assert "<svg" in found._repr_html_()
+    ElementTree.fromstring(found.save(tmp_path / "found.svg").read_text())
+    with pytest.raises(DeclarationError, match=r"\.svg"):
+        found.save(tmp_path / "found.png")
 
 
 FILE = """
@@ -265,6 +272,8 @@ def test_the_command_reads_a_file(
     assert main(["handover", "pair.py", "--calls", "2", "--out", "all.json", "--quiet"]) == 0
     assert "wave after fast" in capsys.readouterr().out
     assert json.loads(Path("all.json").read_text())["calls"] == 2
+    assert main(["handover", "pair.py", "--out", "all.png"]) == 1
+    assert ".svg" in capsys.readouterr().err
     Path("wrong.py").write_text(FILE.replace("steps = 60", "step = 60"))
     assert main(["handover", "wrong.py"]) == 1
     assert "'steps'" in capsys.readouterr().err

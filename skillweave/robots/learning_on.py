@@ -1,0 +1,135 @@
+"""Repair of a pair of ready policies: the second learns a correction, where the first ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave._internal.messages import short
+from skillweave.api import Hierarchy, Run
+from skillweave.envs.make import EnvSpec
+from skillweave.errors import DeclarationError
+from skillweave.policies.core import Array, Step
+from skillweave.robots.aims import Aim
+from skillweave.robots.trial import RobotTrial
+from skillweave.robots.variation import Variation
+from skillweave.skills import Residual, Skill
+
+BEGIN = 2_048
+"""Steps in which the correction begins: it is zero at first, and hardly other afterwards."""
+KINDS = 16
+"""The robots among which an episode of training chooses."""
+
+
+class Varied(gym.Env[Any, Any]):
+    """An environment whose episodes are each of another robot, of a few that were drawn.
+
+    Args:
+        spec: of the environment, without what is drawn.
+        variation: what is drawn.
+    """
+
+    def __init__(self, spec: EnvSpec, variation: Variation) -> None:
+        self._spec = spec
+        self._variation = variation
+        self._kinds: dict[int, gym.Env[Any, Any]] = {}
+        self._now = self._of(0)
+        self.observation_space = self._now.observation_space
+        self.action_space = self._now.action_space
+
+    def _of(self, number: int) -> gym.Env[Any, Any]:
+        """Return the environment of a robot; it is made when it is first needed."""
+        if number not in self._kinds:
+            drawn = self._variation.draw(np.random.default_rng([number]))
+            spec = EnvSpec(self._spec.env, {**self._spec.kwargs, **drawn}, self._spec.wrappers)
+            self._kinds[number] = spec.make()
+        return self._kinds[number]
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Draw a robot, and start its episode."""
+        super().reset(seed=seed)
+        number, own = self.np_random.integers((KINDS, 2**31)).tolist()
+        self._now = self._of(number)
+        return self._now.reset(seed=own, options=options)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the robot."""
+        return self._now.step(action)
+
+    def close(self) -> None:
+        """Close all robots' environments."""
+        for env in self._kinds.values():
+            env.close()
+
+
+def learn_on(
+    trial: RobotTrial,
+    skill: str,
+    after: str,
+    reward: Callable[[Step], Any],
+    scale: Any,
+    steps: int,
+    calls: int,
+    run_dir: str | Path | None,
+    seed: int,
+    *,
+    quiet: bool,
+) -> Run:
+    """Return a run whose skill has learnt a correction; see ``MeasuredHandovers.repair``."""
+    if not callable(reward):
+        raise DeclarationError(
+            f"repair(): reward is {short(reward)}; give a function of a Step that returns (n,) "
+            "numbers, what the skill is to maximise"
+        )
+    if any(part is not None for part in trial.skills.parts):
+        raise DeclarationError("repair() corrects whole actions: leave out acts and sees of skills")
+    declared = [
+        _declared(aim, policy, residual=scale if aim.skill.name == skill else None, reward=reward)
+        for aim, policy in zip(trial.aims, trial.skills.policies, strict=True)
+    ]
+    spec = trial.spec
+    if trial.variation.ranges:
+
+        def varied() -> Varied:
+            """Return an environment of robots that vary."""
+            return Varied(trial.spec, trial.variation)
+
+        varied.__name__ = f"varied_{trial.spec.name}"
+        spec = EnvSpec(varied, engine="sync", check_seed=False)
+    hierarchy = Hierarchy(
+        spec,
+        declared,
+        call_steps=max(trial.steps),
+        selector=lambda obs: [skill] * len(obs),
+        steps=BEGIN,
+        name=f"{skill}-after-{after}",
+    )
+    begun = hierarchy.train(run_dir, seed=seed, quiet=True)
+    repaired = None if run_dir is None else f"{run_dir}-repaired"
+    return begun.repair(
+        skill, after=after, steps=steps, calls=calls, run_dir=repaired, seed=seed, quiet=quiet
+    )
+
+
+def _declared(aim: Aim, policy: Any, residual: Any, reward: Callable[[Step], Any]) -> Skill:
+    """Return a skill whose success is its aim; the one with a ``residual`` learns a correction."""
+
+    def success(self: Skill, step: Step) -> Array:
+        """Return where the aim holds."""
+        event = aim.stays if aim.stays is not None else aim.done
+        return aim.skill.success(step) if event is None else event.holds(step)
+
+    methods: Mapping[str, Any] = {"success": success}
+    if residual is not None:
+        methods = {**methods, "reward": lambda self, step: reward(step)}
+    kind = type("Repaired", (Skill,), dict(methods) | {"name": aim.skill.name})
+    made: Skill = kind()
+    made.policy = policy if residual is None else Residual(policy, scale=residual)
+    made.max_steps, made.call_steps = aim.skill.max_steps, aim.skill.call_steps
+    return made
