@@ -58,7 +58,7 @@ INSIDE = {
     "ParentSelection", "Policy", "Report",
     "Between", "Blame", "CallEnds", "CallLog", "Chain", "ChainChance", "Effect", "Entry",
     "Forecast", "InputPart", "InputSheet", "OutputLimits",
-    "Handover", "MeasuredHandovers", "Pair", "PlannedRun", "Remedies", "Reported",
+    "Handover", "HandoverTable", "MeasuredHandovers", "Pair", "PlannedRun", "Remedies", "Reported",
     "Tried",
     "Rollout", "Run", "Sample", "Seeds", "Skill", "SkillweaveError", "Step", "adam_",
     "clip_grad_norm_", "fetch", "gae", "mask_logits", "masked_mean", "normalize", "tree",

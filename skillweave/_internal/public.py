@@ -78,7 +78,8 @@ PUBLIC = {
     "skillweave.reporting": {"reporting.curves_figure": "plot_curves"},
     "skillweave.robots": {
         "robots.inputs": "InputPart InputSheet OutputLimits",
-        "robots.measured": "Between ChainChance Entry MeasuredHandovers Pair",
+        "robots.measured": "Between ChainChance Entry HandoverTable Pair",
+        "robots.measuring": "MeasuredHandovers",
         "robots.remedies": "Effect Remedies Tried",
     },
     "skillweave.types": {

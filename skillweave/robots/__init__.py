@@ -1,7 +1,7 @@
 """Ready policies of one robot: which can follow which.
 
 Begin with ``measuring``, which has ``sw.handovers``; ``chains`` plays calls one after another, and
-``measured`` is what was found.
+``measured`` is the table.
 """
 
 from typing import TYPE_CHECKING
@@ -18,9 +18,10 @@ if TYPE_CHECKING:
         Between as Between,
         ChainChance as ChainChance,
         Entry as Entry,
-        MeasuredHandovers as MeasuredHandovers,
+        HandoverTable as HandoverTable,
         Pair as Pair,
     )
+    from skillweave.robots.measuring import MeasuredHandovers as MeasuredHandovers
     from skillweave.robots.remedies import (
         Effect as Effect,
         Remedies as Remedies,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -17,12 +17,9 @@ from skillweave._internal.messages import aligned, as_path, short, suggest
 from skillweave._internal.notebooks import table
 from skillweave.calls.handover import START, wilson
 from skillweave.errors import DeclarationError
-from skillweave.policies.core import Array, Step
+from skillweave.policies.core import Array
 from skillweave.robots.counts import exact_chance
-from skillweave.robots.drawing import matrix_svg, page
-from skillweave.robots.remedies import Remedies, find_remedies
-from skillweave.schema import AtLeastOne, fitted
-from skillweave.skills.skill_set import skills_below
+from skillweave.robots.picture import matrix_svg, page
 
 SHOWN = 12
 """The most pairs in the list of a text."""
@@ -30,8 +27,6 @@ CLEAR = 0.05
 """The chance that any pair is called clearly worse where none is."""
 DRAWS = 4000
 """Draws of the shares in a chain, for its interval."""
-REPAIRED = 2_000_000
-"""The number of the first robot on which repaired skills are measured."""
 SUFFIXES = (".json", ".html", ".svg")
 """Of files that can be written."""
 FEW = 3
@@ -161,7 +156,7 @@ class Between:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredHandovers:
+class HandoverTable:
     """Counts of each skill after each other one, each beside a fresh start of the same robot.
 
     Attributes:
@@ -174,8 +169,6 @@ class MeasuredHandovers:
         played: environment steps in all.
         seconds: taken in all.
         stopped: Ctrl-C has ended it.
-        trial: the skills and robots, to try remedies on; None: it was not measured here.
-        run: of ``repair``, with the repaired policy, ``run.policy``; None: nothing was repaired.
     """
 
     skills: tuple[str, ...]
@@ -187,8 +180,6 @@ class MeasuredHandovers:
     played: int = 0
     seconds: float = 0.0
     stopped: bool = False
-    trial: Any = field(default=None, repr=False)
-    run: Any = field(default=None, repr=False)
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
@@ -271,90 +262,6 @@ class MeasuredHandovers:
                 chains.append(_chance((after, name, skill), counts))
         chains.sort(key=lambda one: (-one.estimate, -one.interval[0]))
         return Between(_chance((after, skill), [(direct.done, direct.calls)]), tuple(chains))
-
-    @checked_names
-    def remedies(
-        self,
-        after: str,
-        skill: str,
-        *,
-        robots: int = 40,
-        instead: Mapping[str, Any] | None = None,
-        quiet: bool = False,
-    ) -> Remedies:
-        """Try remedies for a pair: choose one on some robots, and report it on others.
-
-        Tried are each other skill in between; cross-fades and ramps over an eighth and a quarter of
-        a call; and a first skill that is cut so much later. All are played on the same new robots,
-        beside the pair without a remedy. The best, or a gentler one that is at most two robots
-        behind it, is played on as many others, if it wins at least three robots more than it loses;
-        and where it is in force after other skills, too, there as well.
-        Ctrl-C ends it with what was tried.
-
-        Args:
-            after: the name of the skill before.
-            skill: of the one that fails after it.
-            robots: those of the choice; as many others are for the report.
-            instead: further remedies by name: policies in place of the second skill's, such as one
-                that enters its motion a second earlier.
-            quiet: no progress.
-
-        Raises:
-            DeclarationError: there is no such skill, or these handovers were not measured here.
-        """
-        self.pair(after, skill)
-        robots = fitted(AtLeastOne, robots, "robots")
-        if self.trial is None:
-            raise DeclarationError("remedies() needs the skills: call handovers() here first")
-        named = fitted(Mapping[str, Any], instead or {}, "instead")
-        return find_remedies(self.trial, after, skill, robots, named, quiet=quiet)
-
-    @checked_names
-    def repair(
-        self,
-        skill: str,
-        *,
-        after: str,
-        reward: Callable[[Step], Any],
-        scale: Any = 0.5,
-        steps: int = 60_000,
-        calls: int = 60,
-        run_dir: str | Path | None = None,
-        seed: int = 0,
-        quiet: bool = False,
-    ) -> MeasuredHandovers:
-        """Let a skill learn a correction in calls that follow another one, and measure all again.
-
-        A ``Residual`` of its policy learns by ``Run.repair``, on robots that vary as these do. It
-        is kept if the pair is clearly better and no other pair clearly worse. The handovers that
-        are returned are of other robots; their ``run`` has the repaired policy.
-
-        Args:
-            skill: the name of the skill that fails.
-            after: of the one after which it does.
-            reward: a function of a ``Step`` that returns (n,) numbers: what it is to maximise.
-            scale: the largest correction, as of ``Residual``.
-            steps: of training.
-            calls: of the pair, before and after; see ``Run.repair``.
-            run_dir: a new directory; None: the next numbers in ``runs/``.
-            seed: of all that is random.
-            quiet: no progress.
-
-        Raises:
-            DeclarationError: an argument is wrong, these handovers were not measured here, or the
-                pair needs no repair.
-        """
-        from skillweave.robots.learning_on import learn_on
-        from skillweave.robots.measuring import measure
-
-        self.pair(after, skill)
-        if self.trial is None:
-            raise DeclarationError("repair() needs the skills: call handovers() here first")
-        steps, calls = fitted(AtLeastOne, steps, "steps"), fitted(AtLeastOne, calls, "calls")
-        how = steps, calls, run_dir, seed
-        run = learn_on(self.trial, skill, after, reward, scale, *how, quiet=quiet)
-        again = replace(self.trial, skills=skills_below(run.policy))
-        return replace(measure(again, self.calls, quiet=quiet, first=REPAIRED), run=run)
 
     def clearly_worse(self) -> list[Pair]:
         """Return the pairs that lose robots by more than chance, though there are many pairs."""

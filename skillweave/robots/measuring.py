@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.interrupts import deferred, requested
 from skillweave._internal.notices import notice
 from skillweave.calls.handover import START
+from skillweave.errors import DeclarationError
+from skillweave.policies.core import Step
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.robots.chains import ChainPlayer, OpenRobot, Outcome, PlannedCall, Robot
-from skillweave.robots.measured import Entry, MeasuredHandovers
+from skillweave.robots.learning_on import learn_on
+from skillweave.robots.measured import Entry, HandoverTable
+from skillweave.robots.remedies import Remedies, find_remedies
 from skillweave.robots.trial import RobotTrial, check_repeats, make_trial
 from skillweave.schema import AtLeastOne, fitted
+from skillweave.skills.skill_set import skills_below
 
 MOST = 60
 """Entries of a pair that differs from fresh starts in the first ones."""
@@ -23,8 +30,104 @@ DIFFERS = 3
 PATIENCE = 3
 """Tries for each wanted entry: the first skill may fail before."""
 
+REPAIRED = 2_000_000
+"""The number of the first robot on which repaired skills are measured."""
 Cell = tuple[int, int]
 """A skill's place, and before it that of the skill before; −1: a fresh start."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredHandovers(HandoverTable):
+    """Counts of each skill after each other one, and ways to make them better.
+
+    Attributes:
+        trial: the skills and robots; None: it was not measured here.
+        run: of ``repair``, with the repaired policy, ``run.policy``; None: nothing was repaired.
+    """
+
+    trial: Any = field(default=None, repr=False)
+    run: Any = field(default=None, repr=False)
+
+    @checked_names
+    def remedies(
+        self,
+        after: str,
+        skill: str,
+        *,
+        robots: int = 40,
+        instead: Mapping[str, Any] | None = None,
+        quiet: bool = False,
+    ) -> Remedies:
+        """Try remedies for a pair: choose one on some robots, and report it on others.
+
+        Tried are each other skill in between; cross-fades and ramps over an eighth and a quarter of
+        a call; and a first skill that is cut so much later. All are played on the same new robots,
+        beside the pair without a remedy. The best, or a gentler one that is at most two robots
+        behind it, is played on as many others, if it wins at least three robots more than it loses;
+        and where it is in force after other skills, too, there as well.
+        Ctrl-C ends it with what was tried.
+
+        Args:
+            after: the name of the skill before.
+            skill: of the one that fails after it.
+            robots: those of the choice; as many others are for the report.
+            instead: further remedies by name: policies in place of the second skill's, such as one
+                that enters its motion a second earlier.
+            quiet: no progress.
+
+        Raises:
+            DeclarationError: there is no such skill, or these handovers were not measured here.
+        """
+        self.pair(after, skill)
+        robots = fitted(AtLeastOne, robots, "robots")
+        if self.trial is None:
+            raise DeclarationError("remedies() needs the skills: call handovers() here first")
+        named = fitted(Mapping[str, Any], instead or {}, "instead")
+        return find_remedies(self.trial, after, skill, robots, named, quiet=quiet)
+
+    @checked_names
+    def repair(
+        self,
+        skill: str,
+        *,
+        after: str,
+        reward: Callable[[Step], Any],
+        scale: Any = 0.5,
+        steps: int = 60_000,
+        calls: int = 60,
+        run_dir: str | Path | None = None,
+        seed: int = 0,
+        quiet: bool = False,
+    ) -> MeasuredHandovers:
+        """Let a skill learn a correction in calls that follow another one, and measure all again.
+
+        A ``Residual`` of its policy learns by ``Run.repair``, on robots that vary as these do. It
+        is kept if the pair is clearly better and no other pair clearly worse. The handovers that
+        are returned are of other robots; their ``run`` has the repaired policy.
+
+        Args:
+            skill: the name of the skill that fails.
+            after: of the one after which it does.
+            reward: a function of a ``Step`` that returns (n,) numbers: what it is to maximise.
+            scale: the largest correction, as of ``Residual``.
+            steps: of training.
+            calls: of the pair, before and after; see ``Run.repair``.
+            run_dir: a new directory; None: the next numbers in ``runs/``.
+            seed: of all that is random.
+            quiet: no progress.
+
+        Raises:
+            DeclarationError: an argument is wrong, these handovers were not measured here, or the
+                pair needs no repair.
+        """
+        self.pair(after, skill)
+        if self.trial is None:
+            raise DeclarationError("repair() needs the skills: call handovers() here first")
+        steps, calls = fitted(AtLeastOne, steps, "steps"), fitted(AtLeastOne, calls, "calls")
+        how = steps, calls, run_dir, seed
+        run = learn_on(self.trial, skill, after, reward, scale, *how, quiet=quiet)
+        again = replace(self.trial, skills=skills_below(run.policy))
+        return replace(measure(again, self.calls, quiet=quiet, first=REPAIRED), run=run)
 
 
 @checked_names

@@ -17,8 +17,8 @@ from robots.owner import plainly, policies, up
 import skillweave as sw
 from skillweave.errors import DeclarationError, EnvError, PolicyError, SkillError
 from skillweave.robots.counts import exact_chance
-from skillweave.robots.measured import Entry, MeasuredHandovers
-from skillweave.robots.measuring import MOST
+from skillweave.robots.measured import Entry
+from skillweave.robots.measuring import MOST, MeasuredHandovers
 from skillweave.toys.balancer import Balancer
 
 VARY = {"latency": (0, 1), "grip": (0.8, 1.0)}

@@ -13,7 +13,7 @@ from robots.test_handovers import VARY, Line, moving
 
 import skillweave as sw
 from skillweave.errors import DeclarationError
-from skillweave.robots.measured import MeasuredHandovers
+from skillweave.robots.measuring import MeasuredHandovers
 from skillweave.robots.remedies import APART, Effect, Remedies, Tried
 from skillweave.toys.balancer import Balancer
 

@@ -13,7 +13,7 @@ from robots.test_handovers import VARY
 import skillweave as sw
 from skillweave.errors import DeclarationError
 from skillweave.robots.learning_on import KINDS, Varied
-from skillweave.robots.measured import MeasuredHandovers
+from skillweave.robots.measuring import MeasuredHandovers
 from skillweave.robots.variation import Variation
 from skillweave.toys.balancer import Balancer
 
