@@ -60,11 +60,12 @@ class MeasuredHandovers(HandoverTable):
     ) -> Remedies:
         """Try remedies for a pair: choose one on some robots, and report it on others.
 
-        Tried are each other skill in between; cross-fades and ramps over an eighth and a quarter of
-        a call; and a first skill that is cut so much later. All are played on the same new robots,
-        beside the pair without a remedy. The best, or a gentler one that is at most two robots
-        behind it, is played on as many others, if it wins at least three robots more than it loses;
-        and where it is in force after other skills, too, there as well.
+        Tried are cross-fades and ramps over an eighth and a quarter of a call, a first skill that
+        is cut so much later, and each other skill in between, all on the same new robots, beside
+        the pair without a remedy. The best three of those that win at least three robots more than
+        they lose are played on as many robots again. Of these the best is chosen, or a gentler one
+        that is at most two robots behind it. What it does is told of further robots; where it is in
+        force after other skills, too, also for these pairs.
         Ctrl-C ends it with what was tried.
 
         Args:

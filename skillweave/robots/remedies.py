@@ -29,6 +29,8 @@ CLOSE = 2
 """Of remedies that are so few robots behind the best, the gentlest is chosen: more is chance."""
 SURE = 0.05
 """The chance at which a remedy is said to help."""
+FINALISTS = 3
+"""The remedies that are played on as many robots again, before one of them is chosen."""
 SHARES = (8, 4)
 """Ramps, cross-fades and later cuts last this part of a call: an eighth, a quarter."""
 APART = 1_000_000
@@ -96,8 +98,10 @@ class Remedies:
         skill: the one that fails after it.
         robots: those of the choice.
         without: of these, those on which the skill is done without a remedy.
-        tried: all remedies, the chosen one first, then by their gain.
-        effect: of the first of them, on other robots; None: no remedy gained enough to be chosen.
+        tried: all remedies, the best first.
+        finals: the best few of them, with these robots and as many again, the chosen one first.
+        again: all robots of the finals; of these ``without_again`` are done without a remedy.
+        effect: of the chosen one, on other robots; None: no remedy gained enough to be chosen.
         elsewhere: where the remedy is in force after other skills, too: what it does there.
         stopped: Ctrl-C has ended it.
     """
@@ -108,6 +112,9 @@ class Remedies:
     without: int
     tried: tuple[Tried, ...]
     effect: Effect | None
+    finals: tuple[Tried, ...] = ()
+    again: int = 0
+    without_again: int = 0
     elsewhere: tuple[Effect, ...] = ()
     stopped: bool = False
 
@@ -116,7 +123,14 @@ class Remedies:
         """The remedy that helps, also on other robots; None: none does."""
         effect = self.effect
         helps = effect is not None and effect.won > effect.lost and effect.chance < SURE
-        return self.tried[0] if helps else None
+        return self.chosen if helps else None
+
+    @property
+    def chosen(self) -> Tried | None:
+        """The remedy that was chosen; None: none gained enough, or it was stopped before."""
+        if self.effect is None:
+            return None
+        return self.finals[0] if self.finals else self.tried[0]
 
     @property
     def harms(self) -> tuple[Effect, ...]:
@@ -132,6 +146,9 @@ class Remedies:
             "robots": self.robots,
             "without": self.without,
             "tried": [vars(one) for one in self.tried],
+            "finals": [vars(one) for one in self.finals],
+            "again": self.again,
+            "without_again": self.without_again,
             "best": None if best is None else best.name,
             "effect": None if self.effect is None else vars(self.effect),
             "elsewhere": [vars(one) for one in self.elsewhere],
@@ -139,22 +156,29 @@ class Remedies:
         }
 
     def __str__(self) -> str:
-        rows = [["remedy", f"done of {self.robots}", "won", "lost"]]
-        rows.append(["none", str(self.without), "", ""])
-        rows += [[one.name, str(one.done), str(one.won), str(one.lost)] for one in self.tried]
         lines = [f"{self.skill} after {self.after}: on the robots of the choice", ""]
-        lines += [aligned(rows, left=1), ""]
+        lines += [_table(self.robots, self.without, self.tried), ""]
+        if self.finals:
+            lines += [f"The best of them, with {self.again - self.robots} more robots", ""]
+            lines += [_table(self.again, self.without_again, self.finals), ""]
         if self.stopped:
             lines.append("It was stopped: nothing was chosen")
         elif self.effect is None:
             lines.append(f"None helps: no remedy wins {GAIN} robots more than it loses")
         else:
-            lines.append(f"Chosen: {self.tried[0].name}. On other robots: {self.effect}")
-            lines.append(
-                f"Write {self.tried[0].how}" if self.best is not None else "None helps for certain"
-            )
+            assert self.chosen is not None
+            lines.append(f"Chosen: {self.chosen.name}. On other robots: {self.effect}")
+            sure = self.best is not None
+            lines.append(f"Write {self.chosen.how}" if sure else "None helps for certain")
         lines += [f"It makes another pair worse, {effect}" for effect in self.harms]
         return "\n".join(lines)
+
+
+def _table(robots: int, without: int, tried: Sequence[Tried]) -> str:
+    """Return remedies as lines, with those robots that need none."""
+    rows = [["remedy", f"done of {robots}", "won", "lost"], ["none", str(without), "", ""]]
+    rows += [[one.name, str(one.done), str(one.won), str(one.lost)] for one in tried]
+    return aligned(rows, left=1)
 
 
 @dataclass(frozen=True)
@@ -184,34 +208,57 @@ def find_remedies(
     """Try remedies for a pair; see ``MeasuredHandovers.remedies``."""
     i, j = trial.names.index(after), trial.names.index(skill)
     ways = [Way("none", "", trial.skills), *_ways(trial, i, j, instead)]
+    every = range(len(ways))
+    others = [k for k in range(len(trial.names)) if k not in (i, j)]
     rows, elsewhere = list[list[bool]](), list[Effect]()
-    tried = list[Tried]()
+    finals, both = list[int](), list[list[bool]]()
     effect, stopped = None, False
+    total = robots * (len(ways) + FINALISTS + 3)
     with (
         OpenRobot(trial.spec) as where,
-        EpisodeProgress(
-            robots * (len(ways) + 2), quiet=quiet, name="remedies", unit="calls"
-        ) as shown,
+        EpisodeProgress(total, quiet=quiet, name="remedies", unit="calls") as shown,
     ):
         search = _Search(trial, where, ways, robots, shown)
         try:
             with deferred("after this call"):
-                for row in search.compare(i, j, range(len(ways))):
-                    rows.append(row)
-                tried = _tried(ways, rows)
-                if tried[0].gain >= GAIN:
-                    best = [way.name for way in ways].index(tried[0].name)
+                rows += search.compare(i, j, every)
+                gains = _gains(rows)
+                finals = sorted(every[1:], key=lambda k: -gains[k])[:FINALISTS]
+                finals = [k for k in finals if gains[k] >= GAIN]
+                if finals:
+                    both = [[row[k] for k in (0, *finals)] for row in rows]
+                    both += search.compare(i, j, (0, *finals))
+                    best = _choice(finals, _gains(both)[1:])
+                    first = finals.index(best)
                     effect = _effect(after, search.compare(i, j, (0, best)))
-                    others = [k for k in range(len(trial.names)) if k not in (i, j)]
                     for k in others if ways[best].everywhere else ():
                         elsewhere.append(_effect(trial.names[k], search.compare(k, j, (0, best))))
         except KeyboardInterrupt:
-            stopped, effect = True, None
-            tried = _tried(ways, rows)
-    without = sum(row[0] for row in rows)
+            stopped, effect, both = True, None, []
+    if effect is not None:  # the chosen one first
+        order = [first, *(k for k in range(len(finals)) if k != first)]
+        finals = [finals[k] for k in order]
+        both = [[row[0], *(row[1 + k] for k in order)] for row in both]
+    tried = sorted(_tried(ways[1:], rows), key=lambda one: -one.gain)
     return Remedies(
-        after, skill, len(rows), without, tuple(tried), effect, tuple(elsewhere), stopped
+        after,
+        skill,
+        len(rows),
+        sum(row[0] for row in rows),
+        tuple(tried),
+        effect,
+        tuple(_tried([ways[k] for k in finals], both)) if both else (),
+        len(both),
+        sum(row[0] for row in both),
+        tuple(elsewhere),
+        stopped,
     )
+
+
+def _choice(places: Sequence[int], gains: Sequence[int]) -> int:
+    """Return the place of the way that is chosen: of those near the best, the gentlest."""
+    close = [k for k, gain in zip(places, gains, strict=True) if gain >= max(gains) - CLOSE]
+    return min(close)
 
 
 class _Search:
@@ -268,19 +315,19 @@ class _Search:
         return len(found) == len(calls) and found[-1].counts
 
 
+def _gains(rows: Sequence[Sequence[bool]]) -> list[int]:
+    """Return how many robots each way wins, less those that it loses; rows are of robots."""
+    done = np.array(rows, np.int64)
+    return (done - done[:, :1]).sum(0).tolist() if len(done) else [0]
+
+
 def _tried(ways: Sequence[Way], rows: Sequence[Sequence[bool]]) -> list[Tried]:
-    """Return all ways but the first, which is no remedy; the one to choose first."""
-    done = np.array(rows, bool).reshape(len(rows), len(ways))
-    plain = done[:, 0]
-    found = [
-        Tried(
-            way.name, way.how, int(own.sum()), int((own & ~plain).sum()), int((plain & ~own).sum())
-        )
-        for way, own in zip(ways[1:], done[:, 1:].T, strict=True)
+    """Return counts of ways; of a row, a robot, the first number is of no remedy."""
+    done = np.array(rows, bool).reshape(len(rows), 1 + len(ways))
+    return [
+        Tried(way.name, way.how, int(own.sum()), *_differences(own, done[:, 0]))
+        for way, own in zip(ways, done[:, 1:].T, strict=True)
     ]
-    most = max(one.gain for one in found)
-    close = [one for one in found if one.gain >= most - CLOSE]
-    return sorted(found, key=lambda one: (one is not close[0], -one.gain))
 
 
 def _effect(after: str, rows: Iterable[Sequence[bool]]) -> Effect:

@@ -31,7 +31,10 @@ def test_one_is_chosen_and_reported_on_other_robots() -> None:
     best = found.best
     assert best is not None
     assert best.name == "stand in between"
-    assert (best.done, best.won, best.lost) == (8, 8, 0)
+    assert (best.done, best.won, best.lost) == (16, 16, 0)  # with as many robots again
+    assert (found.again, found.without_again) == (16, 0)
+    assert found.finals[0] == best
+    assert (found.tried[0].done, found.tried[0].won) == (8, 8)
     assert found.effect == Effect("fast", 8, 0, 8, 8, 0)
     assert found.effect.chance == 2 / 2**8
     assert "Chosen: stand in between. On other robots: after fast: 0 of 8 without" in str(found)
@@ -112,7 +115,9 @@ def test_ramps_and_cross_fades_are_what_a_plain_loop_does(way: str) -> None:
 def test_it_says_which_other_pairs_a_remedy_makes_worse() -> None:
     tried = (Tried("ramp over 25 steps", "acts", 20, 10, 0),)
     worse, same = Effect("stand", 20, 18, 9, 0, 9), Effect("run", 20, 18, 17, 1, 2)
-    found = Remedies("walk", "wave", 20, 10, tried, Effect("walk", 20, 9, 19, 10, 0), (worse, same))
+    found = Remedies(
+        "walk", "wave", 20, 10, tried, Effect("walk", 20, 9, 19, 10, 0), elsewhere=(worse, same)
+    )
     assert found.harms == (worse,)
     assert "makes another pair worse, after stand: 18 of 20 without, 9 with it" in str(found)
     assert found.to_json()["elsewhere"][0]["lost"] == 9
