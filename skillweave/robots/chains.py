@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Self
@@ -17,7 +17,7 @@ from skillweave.experience.play import SeededEpisodes, play
 from skillweave.policies.core import EPISODE, RUNNING, Array, Memory, RowPolicy, Step, Turn, part_of
 from skillweave.robots.aims import Aim
 from skillweave.skills.lengths import Lengths
-from skillweave.skills.skill_set import SkillSet, acting_policy
+from skillweave.skills.skill_set import SkillSet, acting_policy, within
 
 
 @dataclass(frozen=True)
@@ -65,15 +65,15 @@ class Listed(RowPolicy):
     def __init__(self) -> None:
         self.choices: list[int] = []
         """What is chosen next, from the last one on."""
+        self.may_start: Callable[[Array], Array] | None = None
+        """Returns which choices may start in observations, (n, choices); None: all may."""
         self.refused = False
-        """The latest one may not start there."""
+        """The latest one may not start there: what follows does not count."""
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
-        """Return the next choice (1,); one that may start where that one may not."""
+        """Return the next choice (1,)."""
         choice = self.choices.pop()
-        self.refused = turn.mask is not None and not turn.mask[0, choice]
-        if self.refused:
-            choice = int(turn.mask[0].argmax())  # type: ignore[index]  # nothing counts any more
+        self.refused = self.may_start is not None and not self.may_start(obs)[0, choice]
         return np.array([choice])
 
 
@@ -138,6 +138,11 @@ class ChainPlayer:
         lengths = Lengths(*range(1, longest + 1))
         whole = replace(skills, call_steps=lengths, interruption=None)
         self._policy = acting_policy(whole, self._listed)
+        hierarchy = within(self._policy)
+        if hierarchy.restricts:
+            self._listed.may_start = hierarchy.may_start
+            hierarchy.restricts = False  # where none may start, the call is refused, no more
+        self._limits = [skills.limit(i) for i in range(len(skills.skills))]
 
     def play(self, robot: Robot, calls: Sequence[PlannedCall]) -> list[Outcome]:
         """Play calls from a fresh start of a robot, until one of them is not done.
@@ -167,22 +172,23 @@ class ChainPlayer:
                 continue
             found.append(one.played(call))
             more = len(found) < len(calls)
-            if now.step.truncated[0] and one.ok and (more or self._is_short(one, call, end)):
+            cut_off = more or (self._is_short(one, call, end) and not one.reached)
+            if now.step.truncated[0] and one.ok and cut_off:
                 raise EnvError(
                     f"{self._where.name}: its time limit ended an episode after "
                     f"{int(now.step.elapsed[0]):,} steps, before {len(calls)} calls were over: "
                     "give it a longer limit (max_episode_steps, for example), or shorter calls "
-                    "(steps=, cut=)"
+                    "(steps=, cut=). An episode that the robot ends, by a fall, is to be "
+                    "terminated, not truncated"
                 )
             if not more or not found[-1].done or now.over[0]:
                 break
             one = _OpenCall(self.aims[calls[len(found)].skill])
         return found
 
-    @staticmethod
-    def _is_short(one: _OpenCall, call: PlannedCall, end: int) -> bool:
+    def _is_short(self, one: _OpenCall, call: PlannedCall, end: int) -> bool:
         """Return whether the episode's end has cut a call that would have gone on."""
-        limit = one.aim.skill.max_steps
+        limit = self._limits[call.skill]
         whole = call.steps if limit is None else min(call.steps, limit)
         return end == EPISODE and len(one) < whole
 
@@ -194,7 +200,8 @@ class _OpenCall:
         self.aim = aim
         self.ok = True
         """What has to stay true has been true so far."""
-        self._done = False
+        self.reached = False
+        """What has to happen once has happened."""
         self._steps = 0
         self._kept: list[Step] = []
         self._last: Step | None = None
@@ -212,18 +219,19 @@ class _OpenCall:
             self._kept.append(step)
         if aim.stays is not None:
             self.ok = aim.holds(aim.stays, step)
+        before = self.reached
         if aim.done is not None:
-            self._done = self._done or aim.holds(aim.done, step)
+            self.reached = before or aim.holds(aim.done, step)
         if aim.by_success and ended:
-            self._done = aim.succeeds(step)
-        if step.terminated[0] and aim.stays is not None and not self._done:
+            self.reached = aim.succeeds(step)
+        if step.terminated[0] and aim.stays is not None and not (self.reached and not before):
             self.ok = False  # the episode is over before the call is
         return ended or not self.ok
 
     def played(self, call: PlannedCall) -> Outcome:
         """Return the call, which is over."""
         assert self._last is not None
-        done = self.ok and (self._done or (self.aim.done is None and not self.aim.by_success))
+        done = self.ok and (self.reached or (self.aim.done is None and not self.aim.by_success))
         followed = done and (not call.follows or self.aim.is_followed(self._kept))
         return Outcome(
             call.skill, self._steps, done, followed, False, self._last.next_obs[0].copy()

@@ -30,7 +30,11 @@ EARLY = 10
 FAR = 4.0
 """A number is far if it is so many deviations of the training from its mean there."""
 SHIFTED = 1.5
-"""It is also far if it begins, on average, so many deviations from its mean."""
+"""It is also far if it begins, and is in play, on average so many deviations from its mean."""
+SURE = 3.0
+"""The standard errors by which starts of episodes may be off by chance."""
+VARIES = 0.05
+"""What varies less than so many deviations in play is a constant: a command, for example."""
 SMALL = 0.4
 """A part is too small if it varies at most so much as the other parts do, in deviations."""
 MOVES = 0.1
@@ -41,8 +45,9 @@ PULSE = 3
 """The steps in which an output is changed, to see which number follows it."""
 OTHERS = 0.2
 """The share of outputs that other numbers follow, from which the order is said to be wrong."""
-LEAST_OTHERS = 2
-"""The fewest of these outputs."""
+LEAST_OUTPUTS = 4
+"""The fewest outputs of which the order is looked at: a part of two or three numbers may be a place
+or a direction, and no joints."""
 OF_THEIR_OWN = 0.8
 """The share of outputs that a number of its own has to follow, to say so."""
 UNIT = 0.02
@@ -72,6 +77,8 @@ class InputPart:
         early: (numbers,) the root mean square of the first steps, in these deviations from that
             mean; None: unknown.
         spread: (numbers,) the standard deviation in play, in deviations of the training; None.
+        shift: (numbers,) how far the starts of episodes, and also play, are from the mean, in these
+            deviations; 0 of what does not vary, or where starts differ too much to say; None.
         why: what is far off, in words; empty: nothing is.
     """
 
@@ -84,6 +91,7 @@ class InputPart:
     deviation: Array | None = None
     early: Array | None = None
     spread: Array | None = None
+    shift: Array | None = None
     why: str = ""
 
 
@@ -210,10 +218,10 @@ def inputs(
     The policy plays, and its inputs are compared with the mean and deviation that its model carries
     from training, where it has them: a graph that begins with Sub and Div, rsl_rl's normalization,
     Stable-Baselines3's ``VecNormalize``. A part is far off if a number is more than four deviations
-    from its mean in the first ten steps, if it begins 1.5 deviations from it on average, or if the
-    part varies less than 0.4 times as much as the others do. Each output is also changed for a
-    moment: a part with a number for each output is far off if other numbers follow the outputs, or
-    move against them. So is a gyro that does not turn as gravity does.
+    from its mean in the first ten steps, if it begins, and is on average, 1.5 deviations from it,
+    or if the part varies less than 0.4 times as much as the others do. Each output is also changed
+    for a moment: a part with a number for each of four or more outputs is far off if other numbers
+    follow these, or move against them. So is a gyro that does not turn as gravity does.
 
     Args:
         policy: one with ``sees``, of ``from_onnx``, ``from_torch``, ``from_function`` or
@@ -242,6 +250,11 @@ def inputs(
     spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
     spaces = EnvSpec(spec.env, {**spec.kwargs, **first.settings}, spec.wrappers).spaces
     bound = found.bind(spaces.observation, spaces.action, "inputs()")
+    if found.mapping.sees is None and spaces.observation.shape is None:
+        raise DeclarationError(
+            "inputs() looks at the parts that sees= declares, and this policy is given whole "
+            "observations of a Dict or Tuple"
+        )
     seen = _Seen(bound)
     with OpenRobot(spec) as where:
         for number, robot in enumerate([first, *(next(robots) for _ in range(episodes - 1))]):
@@ -254,8 +267,10 @@ def inputs(
 class _Shown(Model):
     """A model that keeps what it is shown, and whose outputs may be changed for a moment."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, numbers: bool) -> None:
         self.model = model
+        self.numbers = numbers
+        """Its outputs are numbers of an action; else choices, or a dict."""
         self.inputs: list[dict[str, Array]] = []
         self.outputs: list[Array] = []
         self.pulse: tuple[int, float] | None = None
@@ -282,7 +297,8 @@ class _Shown(Model):
             output = np.array(output, np.float64)
             flat = output.reshape(len(output), -1)
             flat[:, place] += size
-        self.outputs.append(np.asarray(output, np.float64).reshape(-1))
+        if self.numbers:
+            self.outputs.append(np.asarray(output, np.float64).reshape(-1))
         return output, after
 
 
@@ -292,7 +308,7 @@ class _Seen:
     def __init__(self, policy: MappedPolicy) -> None:
         acting = policy.in_place
         assert isinstance(acting, Mapped)
-        self.model = _Shown(acting.model)
+        self.model = _Shown(acting.model, acting.outputs.space.kind == "Box")
         self.acting = replace(acting, model=self.model, warn=None)
         self.columns = list(_columns(acting.inputs, policy.observation_space))
         """By part: the input, its name, and the places in the flat input."""
@@ -309,12 +325,12 @@ class _Seen:
         with global_generators(seeds):
             episodes = SeededEpisodes(where.engine(robot), [robot.seed], steps)
             for now in play(self.acting, episodes, rng=seeds.numpy()):
-                if keep:
+                if keep and self.model.numbers:
                     self.actions.append(np.array(now.step.action[0]))
         shown = np.array([_flat(one, self.columns) for one in self.model.inputs])
         if keep:
             self.episodes.append(shown)
-            self.outputs.append(np.array(self.model.outputs))
+            self.outputs.append(np.array(self.model.outputs, np.float64))
         return shown
 
     def sheet(self, policy: MappedPolicy, moved: Mapping[int, str], steps: int) -> InputSheet:
@@ -325,7 +341,8 @@ class _Seen:
         """
         every = np.concatenate(self.episodes)
         early = np.concatenate([one[:EARLY] for one in self.episodes])
-        reset = np.array([one[0] for one in self.episodes]).mean(0)
+        starts = np.array([one[0] for one in self.episodes])
+        reset, doubt = starts.mean(0), starts.std(0) / math.sqrt(len(starts))
         inside = policy.normalized()
         parts, first = [], 0
         for name, source, places in self.columns:
@@ -345,6 +362,12 @@ class _Seen:
                         early=np.sqrt((((early[:, mine] - mean) / deviation) ** 2).mean(0)),
                         spread=every[:, mine].std(0) / deviation,
                     )
+                    off = np.minimum(
+                        np.abs(reset[mine] - mean) - SURE * doubt[mine],
+                        np.abs(every[:, mine].mean(0) - mean),
+                    )
+                    varies = every[:, mine].std(0) > VARIES * deviation
+                    part = replace(part, shift=np.where(varies, off / deviation, 0.0))
             parts.append(part)
         parts = _named(parts, moved)
         lasted = float(np.mean([len(one) for one in self.episodes])) * self.acting.period
@@ -384,7 +407,9 @@ def _at(values: Array, places: Array) -> Array:
 def _named(parts: Sequence[InputPart], moved: Mapping[int, str]) -> list[InputPart]:
     """Return the parts with what is far off about them."""
     far = [_most(part.early) for part in parts]
-    shifts = [_most(_shift(part)) for part in parts]
+    # A goal is what the user wants, and the last action is 0 at the start.
+    own = [part.name not in ("Goal()", "LastAction()") for part in parts]
+    shifts = [_most(part.shift) * mine for part, mine in zip(parts, own, strict=True)]
     found = []
     for k, part in enumerate(parts):
         why = moved.get(k, "")
@@ -392,24 +417,12 @@ def _named(parts: Sequence[InputPart], moved: Mapping[int, str]) -> list[InputPa
             assert part.early is not None
             why = _off(part, int(part.early.argmax()))
         elif max(far) <= FAR and not why:
-            shift = _shift(part)
-            if shift is not None and shifts[k] > SHIFTED:
-                why = _off(part, int(shift.argmax()))
+            if part.shift is not None and shifts[k] > SHIFTED:
+                why = _off(part, int(part.shift.argmax()))
             elif max(shifts) <= SHIFTED and (times := _times_smaller(parts, k)):
                 why = f"it varies {times:.0f} times less than the other parts do: look at its scale"
         found.append(replace(part, why=why))
     return found
-
-
-def _shift(part: InputPart) -> Array | None:
-    """Return how far numbers begin from their mean in training, in deviations; None: unknown.
-
-    A goal is what the user wants, and the last action is 0 at the start.
-    """
-    if part.mean is None or part.name in ("Goal()", "LastAction()"):
-        return None
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.abs(part.reset - part.mean) / part.deviation)
 
 
 def _off(part: InputPart, place: int) -> str:
@@ -455,7 +468,8 @@ def _follows(seen: _Seen, where: OpenRobot, robot: Robot) -> dict[int, str]:
     same = {k: places for k, (_, name, places) in enumerate(seen.columns) if len(places) == count}
     same = {k: x for k, x in same.items() if seen.columns[k][1] not in ("LastAction()", "Goal()")}
     period, chunk = seen.acting.period, seen.acting.chunk
-    if count < 2 or count > MOST_PULSES or not same or period > 1 or chunk is not None:
+    looked = outputs.space.kind == "Box" and LEAST_OUTPUTS <= count <= MOST_PULSES
+    if not looked or not same or period > 1 or chunk is not None:
         return {}
     sizes = np.maximum(seen.outputs[0].std(0), 0.1)
     length = PULSE + 2
@@ -484,15 +498,18 @@ def _order(moved: Array, sign: Array) -> str:
     follows = size.argmax(1)
     other = np.flatnonzero(follows != np.arange(count))
     own = len(set(follows.tolist())) >= OF_THEIR_OWN * count
-    if own and len(other) >= max(LEAST_OTHERS, OTHERS * count):
+    if own and len(other) >= OTHERS * count:
         first = int(other[0])
         return (
-            f"its numbers follow the outputs in another order, {len(other)} of {count}: output "
-            f"{first} moves its number {int(follows[first])}"
+            f"if it is of the joints, its order is another one than that of the outputs, in "
+            f"{len(other)} of {count}: output {first} moves its number {int(follows[first])}"
         )
     against = np.diag(moved) * sign < 0
-    if len(other) < max(LEAST_OTHERS, OTHERS * count) and against.mean() > AGAINST:
-        return f"{int(against.sum())} of its {count} numbers move against the outputs: its sign"
+    if len(other) < OTHERS * count and against.mean() > AGAINST:
+        return (
+            f"if it is of the joints, its sign is wrong: {int(against.sum())} of its {count} "
+            "numbers move against the outputs"
+        )
     return ""
 
 
@@ -513,14 +530,17 @@ def _turns(seen: _Seen) -> dict[int, str]:
         middle = np.concatenate([(one[1:] + one[:-1]) / 2 for one in b])
         if not len(moved) or not moved.any():
             continue
+        fits = dict[int, tuple[float, float, float]]()
         for other in threes:
-            if other == k or seen.columns[other][1] in ("Goal()", "LastAction()"):
-                continue
-            w = [one[:, starts[other] : starts[other] + 3] for one in seen.episodes]
-            w_middle = np.concatenate([(one[1:] + one[:-1]) / 2 for one in w])
-            here, factor, anywhere = _explained(moved, middle, w_middle)
-            name = seen.columns[k][1]
-            if anywhere > TURNS and here > TURNS and factor < 0:
+            if other != k and seen.columns[other][1] not in ("Goal()", "LastAction()"):
+                w = [one[:, starts[other] : starts[other] + 3] for one in seen.episodes]
+                w_middle = np.concatenate([(one[1:] + one[:-1]) / 2 for one in w])
+                fits[other] = _explained(moved, middle, w_middle)
+        if any(here > TURNS and factor > 0 for here, factor, _ in fits.values()):
+            continue  # it is the gyro
+        name = seen.columns[k][1]
+        for other, (here, factor, anywhere) in fits.items():
+            if here > TURNS and factor < 0:
                 found[other] = f"it turns against {name}: its sign"
             elif anywhere > TURNS and here < ELSEWHERE:
                 found[other] = f"it does not turn as {name} does: it is in another frame"

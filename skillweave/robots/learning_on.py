@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import copy
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +90,8 @@ def learn_on(
         )
     if any(part is not None for part in trial.skills.parts):
         raise DeclarationError("repair() corrects whole actions: leave out acts and sees of skills")
-    declared = [
-        _declared(aim, policy, residual=scale if aim.skill.name == skill else None, reward=reward)
+    skills = [
+        declared(aim, policy, residual=scale if aim.skill.name == skill else None, reward=reward)
         for aim, policy in zip(trial.aims, trial.skills.policies, strict=True)
     ]
     spec = trial.spec
@@ -104,7 +105,7 @@ def learn_on(
         spec = EnvSpec(varied, engine="sync", check_seed=False)
     hierarchy = Hierarchy(
         spec,
-        declared,
+        skills,
         call_steps=max(trial.steps),
         selector=lambda obs: [skill] * len(obs),
         steps=BEGIN,
@@ -117,19 +118,23 @@ def learn_on(
     )
 
 
-def _declared(aim: Aim, policy: Any, residual: Any, reward: Callable[[Step], Any]) -> Skill:
+def declared(aim: Aim, policy: Any, residual: Any, reward: Callable[[Step], Any]) -> Skill:
     """Return a skill whose success is its aim; the one with a ``residual`` learns a correction."""
+    skill = aim.skill
+    events = [event for event in (aim.stays, aim.done) if event is not None]
 
     def success(self: Skill, step: Step) -> Array:
         """Return where the aim holds."""
-        event = aim.stays if aim.stays is not None else aim.done
-        return aim.skill.success(step) if event is None else event.holds(step)
+        return np.asarray(np.logical_and.reduce([event.holds(step) for event in events]))
 
-    methods: Mapping[str, Any] = {"success": success}
+    methods: dict[str, Any] = {"success": success} if events else {}
     if residual is not None:
-        methods = {**methods, "reward": lambda self, step: reward(step)}
-    kind = type("Repaired", (Skill,), dict(methods) | {"name": aim.skill.name})
-    made: Skill = kind()
+        methods["reward"] = lambda self, step: reward(step)
+        if skill.fade is not None:
+            raise DeclarationError(
+                f"skill {skill.name!r} has fade, and a skill that learns acts alone: leave it out"
+            )
+    made = copy.copy(skill)  # with its own starts, ends and limits
+    made.__class__ = type(type(skill).__name__, (type(skill),), methods | {"name": skill.name})
     made.policy = policy if residual is None else Residual(policy, scale=residual)
-    made.max_steps, made.call_steps = aim.skill.max_steps, aim.skill.call_steps
     return made

@@ -27,6 +27,8 @@ CLEAR = 0.05
 """The chance that any pair is called clearly worse where none is."""
 DRAWS = 4000
 """Draws of the shares in a chain, for its interval."""
+LATER = 20
+"""The fewest later robots by which a pair is judged that was played on more than planned."""
 SUFFIXES = (".json", ".html", ".svg")
 """Of files that can be written."""
 FEW = 3
@@ -77,7 +79,8 @@ class Pair:
         lost: robots on which it is done alone, but not after that skill.
         won: robots on which it is done after that skill, but not alone.
         chance: how likely such a difference is where the skill before makes none (McNemar's exact
-            test), on robots that did not choose to look at this pair longer.
+            test), on robots that did not choose to look at this pair longer; where there are few of
+            these, on all of them, twice as likely.
         not_followed: entries that stayed, and did not do what was asked for.
         refused: entries at which the skill may not start.
         cuts_lost: the fewest and the most steps of the call before, where it was not done; None: it
@@ -447,8 +450,11 @@ class HandoverTable:
         some = [entry for entry in some if entry.robot in fresh]
         lost = np.array([fresh[e.robot] and not e.counts for e in some], bool)
         won = np.array([e.counts and not fresh[e.robot] for e in some], bool)
-        # More robots than planned were played as the first ones differed: these do not count.
-        own = slice(self.calls, None) if len(some) > self.calls else slice(None)
+        # More robots than planned were played as the first ones differed: these do not count. Where
+        # few came after them, all do, for a chance of two looks.
+        later = len(some) - self.calls
+        own = slice(self.calls, None) if later >= LATER else slice(None)
+        looks = 2 if 0 < later < LATER else 1
         failing = [entry for entry in some if not entry.counts]
         done = [entry for entry in some if entry.counts]
         falls = [entry.steps for entry in failing if not entry.done and not entry.refused]
@@ -460,7 +466,7 @@ class HandoverTable:
             sum(fresh[entry.robot] for entry in some),
             int(lost.sum()),
             int(won.sum()),
-            exact_chance(int(lost[own].sum()), int(won[own].sum())),
+            min(1.0, looks * exact_chance(int(lost[own].sum()), int(won[own].sum()))),
             sum(entry.done for entry in failing),
             sum(entry.refused for entry in failing),
             _range([entry.cut for entry in failing]),
@@ -470,9 +476,11 @@ class HandoverTable:
 
 
 def check_suffix(path: Path) -> None:
-    """Raise a DeclarationError where handovers are not written as a file of this suffix."""
+    """Raise a DeclarationError where handovers cannot be written as this file."""
     if path.suffix not in SUFFIXES:
         raise DeclarationError(f"{path} must end in one of {', '.join(SUFFIXES)}")
+    if not path.parent.is_dir():
+        raise DeclarationError(f"{path}: there is no folder {path.parent}")
 
 
 _HEAD = ("pair", "done", "fresh start, same robots", "lost", "won", "chance alike")

@@ -23,8 +23,8 @@ from skillweave.robots.trial import RobotTrial, check_repeats, make_trial
 from skillweave.schema import AtLeastOne, fitted
 from skillweave.skills.skill_set import skills_below
 
-MOST = 60
-"""Entries of a pair that differs from fresh starts in the first ones."""
+MORE = 40
+"""Further entries of a pair that differs from fresh starts in the first ones."""
 DIFFERS = 3
 """A pair is measured further where it has lost so many robots more than it has won."""
 PATIENCE = 3
@@ -150,7 +150,7 @@ def handovers(
 
     Nothing is trained, and no selector is needed. Each entry is paired with a fresh start of the
     same robot, so that what is lost by the skill before is told apart from what the skill cannot do
-    anyway. Pairs that differ in the first entries are played on more robots, ``MOST`` at most.
+    anyway. Pairs that differ in the first entries are played on 40 more robots.
     Ctrl-C ends it with what is measured so far.
 
     A call is done if ``stays`` is true in each of its steps, if ``done`` is true in one of them
@@ -198,7 +198,7 @@ def measure(trial: RobotTrial, calls: int, *, quiet: bool, first: int = 0) -> Me
     robot = next(robots)
     with OpenRobot(trial.spec) as where:
         player = trial.player(where)
-        check_repeats(player, robot, trial.steps[0])
+        check_repeats(trial, player, robot)
         plan = _Plan(trial, player, calls)
         started = time.monotonic()
         stopped = False
@@ -313,7 +313,7 @@ class _Plan:
         """Count a robot that a pair has lost or won; measure further where it is many."""
         self._lost[cell] += int(alone) - int(after)
         if self._count[cell] == self._calls and abs(self._lost[cell]) >= DIFFERS:
-            self._targets[cell] = max(MOST, self._calls)
+            self._targets[cell] = self._calls + MORE
 
     def _add(self, robot: Robot, after: str, cut: int, found: Outcome) -> None:
         self.entries.append(

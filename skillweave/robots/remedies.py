@@ -12,6 +12,7 @@ import numpy as np
 
 from skillweave._internal.interrupts import deferred, requested
 from skillweave._internal.messages import aligned
+from skillweave.errors import DeclarationError
 from skillweave.policies.core import Array
 from skillweave.policies.spaces import space_of
 from skillweave.reporting.progress import EpisodeProgress
@@ -208,6 +209,9 @@ def find_remedies(
     """Try remedies for a pair; see ``MeasuredHandovers.remedies``."""
     i, j = trial.names.index(after), trial.names.index(skill)
     ways = [Way("none", "", trial.skills), *_ways(trial, i, j, instead)]
+    names = [way.name for way in ways]
+    if twice := [name for name in instead if names.count(name) > 1]:
+        raise DeclarationError(f"instead has {twice[0]!r}, which is a remedy already: rename it")
     every = range(len(ways))
     others = [k for k in range(len(trial.names)) if k not in (i, j)]
     rows, elsewhere = list[list[bool]](), list[Effect]()

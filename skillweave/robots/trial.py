@@ -13,6 +13,7 @@ import numpy as np
 from skillweave._internal.messages import short
 from skillweave._internal.seeding import Seeds
 from skillweave.api import Hierarchy
+from skillweave.calls.handover import START
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, EnvError
 from skillweave.hierarchy.fitting import check_settings, ready_policies
@@ -130,6 +131,10 @@ def _skill_set(spec: EnvSpec, skills: Any) -> SkillSet:
                 )
         found = roles.outermost.skill_set(policies)
     for skill in found.skills:
+        if skill.name == START:
+            raise DeclarationError(
+                f"a skill is named {START!r}, which means a fresh start here: give it another name"
+            )
         if skill.goal_space is not None:
             raise DeclarationError(
                 f"skill {skill.name!r} has goals, and handovers() would not know which to give: "
@@ -182,13 +187,15 @@ def _cuts(cut: Any, most: Sequence[int]) -> list[tuple[int, int]]:
     return [(low, high)] * len(most)
 
 
-def check_repeats(player: ChainPlayer, robot: Robot, steps: int) -> None:
-    """Raise an EnvError where the same robot does otherwise when it is played again."""
-    once, again = (player.play(robot, [PlannedCall(0, steps)])[0] for _ in range(2))
-    if once.steps != again.steps or not np.array_equal(once.last, again.last):
-        raise EnvError(
-            f"reset(seed={robot.seed}) and the same skill came to another end when they were "
-            "played again, so an entry cannot be compared with a fresh start of the same robot: "
-            "let the environment draw all that is random from self.np_random, which reset(seed=) "
-            "seeds, and let no policy keep a state of its own (state=)"
-        )
+def check_repeats(trial: RobotTrial, player: ChainPlayer, robot: Robot) -> None:
+    """Raise an EnvError where the same robot does otherwise when a skill is played again."""
+    for i, name in enumerate(trial.names):
+        call = [PlannedCall(i, trial.steps[i], follows=False)]
+        once, again = (player.play(robot, call)[0] for _ in range(2))
+        if once.steps != again.steps or not np.array_equal(once.last, again.last):
+            raise EnvError(
+                f"reset(seed={robot.seed}) and the skill {name!r} came to another end when they "
+                "were played again, so an entry cannot be compared with a fresh start of the same "
+                "robot: let the environment draw all that is random from self.np_random, which "
+                "reset(seed=) seeds, and let no policy keep a state of its own (state=)"
+            )

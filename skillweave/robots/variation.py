@@ -48,15 +48,16 @@ def _check(name: str, values: Any) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    plain = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     return plain and bool(np.isfinite(value))
 
 
 def _drawn(values: Any, rng: np.random.Generator) -> Any:
     if isinstance(values, list):
-        return values[int(rng.integers(len(values)))]
+        value = values[int(rng.integers(len(values)))]
+        return value.item() if isinstance(value, np.generic) else value
     low, high = values
-    if isinstance(low, int) and isinstance(high, int):
+    if isinstance(low, int | np.integer) and isinstance(high, int | np.integer):
         return int(rng.integers(low, high + 1))
     return float(rng.uniform(low, high))
 

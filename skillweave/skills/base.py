@@ -93,8 +93,8 @@ class Skill:
         call_steps: the most steps of a call, wherever it is trained; None: the hierarchy's.
         fade: the steps of a call in which the skill before acts on, and both actions are mixed: the
             k-th of n steps has k/n of this skill's. A number, or numbers by the name of the skill
-            before. Only of a skill that is ready, with actions of a Box. None: it takes over at
-            once.
+            before. Only of a skill that is ready, with actions of a Box. A skill that is left
+            while it fades in counts as if it had acted alone. None: it takes over at once.
         steps: training steps where it learns apart; None: its share of ``Hierarchy.steps``.
         task_weight: weight of the task's advantage beside its own reward where skills learn
             together; None: ``Together.task_weight`` (1). 0: only its own reward counts, as it

@@ -167,15 +167,15 @@ class _Reader:
         if part.places is not None:
             every = [take.size for take in self._reads(replace(part, places=None), False, where)]
         own = places_in(part.places, sum(every), f"{where}.places")
-        held = np.isin(own, places_in(part.held, sum(every), f"{where}.held"))
+        hidden = places_in(part.held, sum(every), f"{where}.held")
+        held = np.isin(own, hidden)
         if not held.any():
             raise PolicyError(f"{where}.held names no number that the part reads")
-        if part.held_at is None:
-            values = _wide(part.offset, sum(sizes), f"{where}.offset")[held]
-        else:
-            values = _wide(part.held_at, int(held.sum()), f"{where}.held_at")
-        at = np.zeros(len(own))
-        at[held] = values
+        at = _wide(part.offset, len(own), f"{where}.offset").copy()
+        if part.held_at is not None:
+            values = _wide(part.held_at, len(hidden), f"{where}.held_at")
+            shown = dict(zip(hidden.tolist(), values.tolist(), strict=True))
+            at = np.array([shown.get(place, 0.0) for place in own.tolist()])
         ends = np.cumsum(sizes)[:-1]
         return [
             replace(take, held=tuple(np.flatnonzero(mine).tolist()), held_at=numbers[mine])

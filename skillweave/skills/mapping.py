@@ -129,6 +129,10 @@ class Part(Scaling):
     """What it is shown there instead, before offset and scale: a number, or one for each of
     ``held``. None: the offset, so the default pose."""
 
+    def __post_init__(self) -> None:
+        if self.held_at is not None and self.held is None:
+            raise DeclarationError("Part.held_at is given, but no places: give held, too")
+
 
 @settings
 class Goal(Scaling):
@@ -273,6 +277,16 @@ class PolicyMapping:
         kinds["anew"] = tuple[Anew, ...]
         for name, kind in kinds.items():
             object.__setattr__(self, name, fitted(kind, getattr(self, name), name))
+        kept = {
+            "state": bool(self.state),
+            "last_action": any(isinstance(source, LastAction) for source in self.sources()),
+            "held": self.every > 1 or self.chunk is not None,
+        }
+        if idle := [name for name in self.anew if not kept[name]]:
+            raise DeclarationError(
+                f"anew names {idle[0]!r}, but the policy remembers none: it has no "
+                "state=, no LastAction() in sees, or no every= and chunk="
+            )
         if self.goal is not None and not self.goal_places:
             raise DeclarationError(
                 "goal is given, but the policy does not take it: write Goal() at its place in sees"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from calls.worlds import OBSERVATIONS, Crane, crane, leaves, numbers
@@ -38,8 +39,6 @@ class Drawn:
     anew: tuple[str, ...]
     every: int
     call_steps: int | None
-    corrects: bool
-    """A ready correction is around it: a hierarchy below does not hide its ramp."""
 
     def answer(self, inputs: Array, state: Array) -> tuple[Array, Array]:
         """Outputs (n, 3) for inputs (n, K) and states (n, 2), and the next states."""
@@ -56,7 +55,8 @@ class Drawn:
         """It in the library's terms."""
         arm = sw.Part("arm", offset=HOME, scale=2.0)
         if self.held:
-            arm = sw.Part("arm", offset=HOME, scale=2.0, held=self.held, held_at=self.held_at)
+            at = self.held_at
+            arm = sw.Part("arm", offset=HOME, scale=2.0, held=self.held, held_at=at)
         policy = sw.from_function(
             self.answer,
             sees=(arm, "hook", sw.LastAction(scale=0.5)),
@@ -81,11 +81,10 @@ def drawn(seed: int) -> list[Drawn]:
         others = [other for other in NAMES if other != name]
         fade = of(None, None, 1, 3, 6, {others[0]: 4}, {others[0]: 2, others[1]: 5})
         held = of((), (), (0,), (1,), (0, 1))
-        anew = tuple(x for x in ("state", "last_action", "held") if rng.random() < 0.3)
-        return Drawn(
-            seed, name, of(0, 0, 1, 3, 5), fade, held, of(None, 0.0, 0.7), anew, of(1, 1, 3),
-            of(None, None, 2), False,
-        )  # fmt: skip
+        ramp, held_at, every = of(0, 0, 1, 3, 5), of(None, 0.0, 0.7), of(1, 1, 3)
+        names = ("state", "last_action", "held")[: 2 + (every > 1)]
+        anew = tuple(x for x in names if rng.random() < 0.3)
+        return Drawn(seed, name, ramp, fade, held, held_at, anew, every, of(None, None, 2))
 
     return [skill(name) for name in NAMES]
 
@@ -327,6 +326,21 @@ def test_a_run_keeps_the_fade_with_which_it_was_made(tmp_path: Path) -> None:
     assert [skill.fade for skill in loaded.hierarchy.skills] == [skill.fade for skill in skills]
 
 
+def test_numbers_that_are_held_stand_where_they_are_named() -> None:
+    def seen(part: sw.Part) -> Any:
+        shown: list[Any] = []
+        policy = sw.from_function(lambda x: shown.append(x.copy()) or x[:, :1], sees=(part,))
+        box = gym.spaces.Box(-99, 99, (4,), np.float32)
+        bound = policy.bind(box, gym.spaces.Box(-99, 99, (1,), np.float32), "it")
+        bound.act(bound.start(1), np.float32([[10, 11, 12, 13]]))
+        return shown[-1][0].tolist()
+
+    assert seen(sw.Part(held=(3, 1), held_at=(3.0, 1.0))) == [10, 1, 12, 3]
+    assert seen(sw.Part(places=(3, 0), held=(3, 1), held_at=(3.0, 1.0))) == [3, 10]
+    assert seen(sw.Part(held=(2,), offset=(1, 2, 3, 4))) == [9, 9, 0, 9]
+    assert seen(sw.Part(held=slice(1, 3), held_at=0.0, scale=2.0)) == [20, 0, 0, 26]
+
+
 def skill_with(**attributes: Any) -> sw.Skill:
     still = sw.from_function(lambda obs: np.zeros((len(obs), 3), np.float32))
     made: sw.Skill = type("it", (sw.Skill,), {"policy": still} | attributes)()
@@ -368,4 +382,8 @@ def test_wrong_words_are_refused_where_they_are_written() -> None:
         sw.Acts(ramp=-1)
     with pytest.raises(DeclarationError, match="anew"):
         sw.from_function(lambda x: x, anew="clock")
+    with pytest.raises(DeclarationError, match="anew names 'state'"):
+        sw.from_function(lambda x: x, anew="state")
+    with pytest.raises(DeclarationError, match="held_at"):
+        sw.Part("arm", held_at=0.0)
     assert OBSERVATIONS["arm"].shape == HOME.shape

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from robots.walker import HOME, ORDER, Walker, policy_of, right, trained_on, write
@@ -142,6 +143,113 @@ def test_it_is_written_as_json_by_the_command(
     assert "env" in capsys.readouterr().err
     sheet = sw.inputs(mapped(file), Walker, episodes=1)
     assert "<table>" in sheet._repr_html_()
+
+
+class Drone(gym.Env[Any, Any]):
+    """Roll, pitch and thrust move it along y, x and z; a body that turns, and a goal."""
+
+    observation_space = gym.spaces.Dict(
+        {k: gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+         for k in ("pos", "vel", "gyro", "gravity")}
+    )  # fmt: skip
+    action_space = gym.spaces.Box(-1, 1, (3,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.pos, self.vel = self.np_random.uniform(-1, 1, (2, 3))
+        self.gyro = self.np_random.uniform(-0.3, 0.3, 3)
+        self.gravity = np.array([0.0, 0.0, -1.0])
+        return self._obs(), {}
+
+    def _obs(self) -> Any:
+        names = ("pos", "vel", "gyro", "gravity")
+        return {k: np.asarray(getattr(self, k), np.float32) for k in names}
+
+    def step(self, action: Any) -> Any:
+        self.vel = self.vel + 0.1 * np.float64(action)[[1, 0, 2]] - 0.02 * self.vel
+        self.pos = self.pos + 0.1 * self.vel
+        self.gyro = 0.98 * self.gyro + 0.1 * np.cross(self.gravity, [0.0, 0.0, -1.0])
+        self.gravity = self.gravity + 0.1 * np.cross(self.gravity, self.gyro)
+        self.gravity = self.gravity / np.linalg.norm(self.gravity)
+        return self._obs(), 0.0, False, False, {}
+
+
+def test_a_place_is_no_joint_and_a_speed_no_gyro() -> None:
+    def steer(x: Any) -> Any:
+        return -0.5 * (x[:, [1, 0, 2]] + x[:, [4, 3, 5]])
+
+    drone = sw.from_function(steer, sees=("pos", "vel", "gyro", "gravity"))
+    assert sw.inputs(drone, Drone).far == ()
+    reach = sw.from_function(lambda x: np.clip(0.3 * x, -1, 1), sees=("gyro",))
+    assert sw.inputs(reach, Drone).far == ()
+
+
+def test_a_command_a_phase_and_wide_starts_are_not_far(tmp_path: Path) -> None:
+    class Paced(Walker):
+        observation_space = gym.spaces.Dict(
+            Walker.observation_space.spaces
+            | {k: gym.spaces.Box(-9, 9, (1,), np.float32) for k in ("command", "phase", "place")}
+        )
+        drawn = False
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            rng = np.random.default_rng(seed)
+            self.t = int(rng.integers(50)) if self.drawn else 0
+            self.place = rng.uniform(-1, 1, 1)
+            self.command = rng.uniform(-1, 1, 1) if self.drawn else np.ones(1)
+            return super().reset(seed=seed)
+
+        def _obs(self) -> Any:
+            found = super()._obs() | {"phase": np.float32([self.t / 50 % 1.0])}
+            return found | {k: np.float32(getattr(self, k)) for k in ("command", "place")}
+
+        def step(self, action: Any) -> Any:
+            self.t += 1
+            self.place = 0.98 * self.place
+            return super().step(action)
+
+    names = (*ORDER, "command", "phase", "place")
+
+    def all_of(obs: Any) -> Any:
+        return np.concatenate([np.float64(obs[k]) - (HOME if k == "joints" else 0) for k in names])
+
+    class Drawn(Paced):
+        drawn = True
+
+    rows = []
+    for episode in range(20):
+        env = Drawn()
+        obs, _ = env.reset(seed=episode)
+        for _ in range(60):
+            rows.append(all_of(obs))
+            obs, *_ = env.step(HOME + policy_of(rows[-1][None, :14])[0])
+    path = tmp_path / "paced.onnx"
+    write(path, also=(np.mean(rows, axis=0)[14:], np.std(rows, axis=0)[14:]))
+    parts = right() | {k: k for k in names[4:]}
+    policy = sw.from_onnx(path, sees=tuple(parts[k] for k in names), acts=ACTS)
+    for seed in range(4):
+        assert sw.inputs(policy, Paced, seed=seed).far == ()
+
+
+def test_dicts_and_choices_of_a_part_are_looked_at_too() -> None:
+    whole = sw.from_function(lambda obs: np.zeros((len(obs["gyro"]), 4)))
+    with pytest.raises(DeclarationError, match="sees="):
+        sw.inputs(whole, Walker)
+    chosen = sw.from_function(
+        lambda x: np.zeros(len(x), np.int64),
+        sees=(sw.Part(places=(0, 1)),),
+        acts=sw.Acts(to=(1, 0)),
+    )
+    assert sw.inputs(chosen, "CartPole-v1", steps=5, episodes=2).outputs is None
+
+    class Named(Walker):
+        action_space = gym.spaces.Dict({"legs": Walker.action_space})
+
+        def step(self, action: Any) -> Any:
+            return super().step(action["legs"])
+
+    named = sw.from_function(lambda x: {"legs": np.tile(HOME, (len(x), 1))}, sees=("joints",))
+    assert sw.inputs(named, Named, steps=5, episodes=2).outputs is None
 
 
 def test_choices_whole_observations_and_mistakes(file: Path) -> None:

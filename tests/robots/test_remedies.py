@@ -166,6 +166,9 @@ def test_mistakes_end_in_a_sentence() -> None:
         found.remedies("fast", "wvae")
     with pytest.raises(DeclarationError, match="robots"):
         found.remedies("fast", "wave", robots=0)
+    fast = policies()["fast"]
+    with pytest.raises(DeclarationError, match="rename"):
+        found.remedies("fast", "wave", instead={"ramp over 25 steps": fast})
     with pytest.raises(DeclarationError, match="instead"):
         found.remedies("fast", "wave", instead={"other": 3})
     with pytest.raises(DeclarationError, match="handovers"):

@@ -12,7 +12,7 @@ from robots.test_handovers import VARY
 
 import skillweave as sw
 from skillweave.errors import DeclarationError
-from skillweave.robots.learning_on import KINDS, Varied
+from skillweave.robots.learning_on import KINDS, Varied, declared
 from skillweave.robots.measuring import MeasuredHandovers
 from skillweave.robots.variation import Variation
 from skillweave.toys.balancer import Balancer
@@ -52,6 +52,39 @@ def test_mistakes_end_in_a_sentence() -> None:
         found.repair("wave", after="fsat", reward=upright)
     with pytest.raises(DeclarationError, match="handovers"):
         MeasuredHandovers(("a", "b"), (), 1, (1, 1)).repair("a", after="b", reward=upright)
+
+
+@pytest.mark.needs("repair")
+def test_what_is_repaired_is_what_was_measured(tmp_path: Path) -> None:
+    skills = policies()
+
+    class Fast(sw.Skill):
+        policy = skills["fast"]
+        fade = 5
+
+        def termination(self, step: sw.Step) -> Any:
+            return step.elapsed >= 15
+
+    class Wave(sw.Skill):
+        policy = skills["wave"]
+
+        def initiation(self, obs: Any) -> Any:
+            return np.abs(obs["tilt"][:, 0]) < 0.3
+
+    found = sw.handovers(Balancer, [Fast(), Wave()], steps=60, stays=up, calls=2, quiet=True)
+    fast, wave = (
+        declared(aim, policy, residual, upright)
+        for aim, policy, residual in zip(
+            found.trial.aims, found.trial.skills.policies, (None, 0.5), strict=True
+        )
+    )
+    assert (fast.name, fast.fade, wave.name, wave.fade) == ("fast", 5, "wave", None)
+    assert fast.defines("termination")
+    assert wave.defines("initiation")
+    assert wave.defines("success")
+    assert wave.defines("reward")
+    with pytest.raises(DeclarationError, match="fade"):
+        declared(found.trial.aims[0], skills["fast"], 0.5, upright)
 
 
 def test_episodes_of_training_are_each_of_a_robot_that_was_drawn() -> None:

@@ -89,16 +89,28 @@ def trained_on() -> tuple[Any, Any]:
     return np.mean(rows, axis=0), np.std(rows, axis=0) + 1e-2
 
 
-def write(path: Path, divides: bool = True, carries: bool = True) -> None:
-    """Write the policy as an ONNX file, with Sub and Div, or Sub and Mul, in front."""
+def write(
+    path: Path, divides: bool = True, carries: bool = True, also: tuple[Any, Any] | None = None
+) -> None:
+    """Write the policy as an ONNX file, with Sub and Div, or Sub and Mul, in front.
+
+    Args:
+        also: the mean and deviation of further inputs, which do nothing.
+    """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
     mean, deviation = trained_on()
-    scaled = weights() * deviation[:, None] if carries else weights()
+    matrix = weights()
+    if also is not None:
+        mean, deviation = (
+            np.concatenate(pair) for pair in zip((mean, deviation), also, strict=True)
+        )
+        matrix = np.concatenate([matrix, np.zeros((len(also[0]), 4))])
+    scaled = matrix * deviation[:, None] if carries else matrix
     constants = {
         "mean": mean[None], "by": deviation[None] if divides else 1 / deviation[None],
-        "w": scaled, "b": mean @ weights() if carries else np.zeros(4),
+        "w": scaled, "b": mean @ matrix if carries else np.zeros(4),
         "low": np.array(-0.6), "high": np.array(0.6),
     }  # fmt: skip
     nodes = [
@@ -110,7 +122,7 @@ def write(path: Path, divides: bool = True, carries: bool = True) -> None:
     graph = helper.make_graph(
         nodes if carries else nodes[2:],
         "walk",
-        [helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["n", 14])],
+        [helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["n", len(mean)])],
         [helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["n", 4])],
         [numpy_helper.from_array(np.float32(x), name) for name, x in constants.items()],
     )
