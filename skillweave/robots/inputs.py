@@ -167,11 +167,19 @@ class InputSheet:
         return found
 
     def __str__(self) -> str:
-        return "\n\n".join([aligned([list(_HEAD), *self._rows()], left=1), *self.sentences()])
+        return "\n\n".join([aligned([list(_HEAD), *self._rows()], left=1), *self._notes()])
 
     def _repr_html_(self) -> str:
-        notes = table((), [[sentence] for sentence in self.sentences()])
+        notes = table((), [[sentence] for sentence in self._notes()])
         return f"{table(_HEAD, self._rows())}{notes}"
+
+    def _notes(self) -> list[str]:
+        """Return what is far off, and before it the range of actions."""
+        if self.outputs is None:
+            return self.sentences()
+        most = float(self.outputs.at_limit.max())
+        span = _span(self.outputs.low, self.outputs.high)
+        return [f"Actions: {span}, at a limit in at most {most:.0%} of steps", *self.sentences()]
 
     def _rows(self) -> list[list[str]]:
         return [
