@@ -48,6 +48,8 @@ OTHERS = 0.2
 LEAST_OUTPUTS = 4
 """The fewest outputs of which the order is looked at: a part of two or three numbers may be a place
 or a direction, and no joints."""
+CLEARLY = 2.0
+"""Another number follows an output where it moves so many times as far as that of its place."""
 OF_THEIR_OWN = 0.8
 """The share of outputs that a number of its own has to follow, to say so."""
 UNIT = 0.02
@@ -397,8 +399,18 @@ def _columns(
     for name, one in inputs.items():
         first = 0
         for take in one.takes:
-            yield name, take.name, np.arange(first, first + take.size)
+            yield name, take.name + _places(take.places), np.arange(first, first + take.size)
             first += take.size
+
+
+def _places(places: tuple[int, ...] | None) -> str:
+    """Return places of a part in words, as Python writes them; empty: it takes all."""
+    if places is None:
+        return ""
+    first, last = places[0], places[-1]
+    if places == tuple(range(first, last + 1)):
+        return f"[{first}:{last + 1}]"
+    return f"[{', '.join(map(str, places[:3]))}{', ...' * (len(places) > 3)}]"
 
 
 def _flat(shown: Mapping[str, Array], columns: Sequence[tuple[str, str, Array]]) -> Array:
@@ -504,7 +516,7 @@ def _order(moved: Array, sign: Array) -> str:
     if not (size.max(1) > 0).all():
         return ""
     follows = size.argmax(1)
-    other = np.flatnonzero(follows != np.arange(count))
+    other = np.flatnonzero(size.max(1) > CLEARLY * np.diag(size))
     own = len(set(follows.tolist())) >= OF_THEIR_OWN * count
     if own and len(other) >= OTHERS * count:
         first = int(other[0])
