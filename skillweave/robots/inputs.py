@@ -77,7 +77,7 @@ class InputPart:
         mean: (numbers,) of the training, that the model carries; None: it carries none.
         deviation: (numbers,) the same.
         early: (numbers,) the root mean square of the first steps, in these deviations from that
-            mean; None: unknown.
+            mean, or of all steps, if that is less: a start may be unlike the rest; None: unknown.
         spread: (numbers,) the standard deviation in play, in deviations of the training; None.
         shift: (numbers,) how far the starts of episodes, and also play, are from the mean, in these
             deviations; 0 of what does not vary, or where starts differ too much to say; None.
@@ -228,10 +228,11 @@ def inputs(
     The policy plays, and its inputs are compared with the mean and deviation that its model carries
     from training, where it has them: a graph that begins with Sub and Div, rsl_rl's normalization,
     Stable-Baselines3's ``VecNormalize``. A part is far off if a number is more than four deviations
-    from its mean in the first ten steps, if it begins, and is on average, 1.5 deviations from it,
-    or if the part varies less than 0.4 times as much as the others do. Each output is also changed
-    for a moment: a part with a number for each of four or more outputs is far off if other numbers
-    follow these, or move against them. So is a gyro that does not turn as gravity does.
+    from its mean, in the first ten steps and in all; if it begins, and is on average, 1.5
+    deviations from it; or if the part varies less than 0.4 times as much as the others do. Each
+    output is also changed for a moment: a part with a number for each of four or more outputs is
+    far off if other numbers follow these, or move against them. So is a gyro that does not turn as
+    gravity does.
 
     Args:
         policy: one with ``sees``, of ``from_onnx``, ``from_torch``, ``from_function`` or
@@ -369,7 +370,12 @@ class _Seen:
                         part,
                         mean=mean,
                         deviation=deviation,
-                        early=np.sqrt((((early[:, mine] - mean) / deviation) ** 2).mean(0)),
+                        early=np.minimum(
+                            *(
+                                np.sqrt((((shown[:, mine] - mean) / deviation) ** 2).mean(0))
+                                for shown in (early, every)
+                            )
+                        ),
                         spread=every[:, mine].std(0) / deviation,
                     )
                     off = np.minimum(
@@ -379,7 +385,7 @@ class _Seen:
                     varies = every[:, mine].std(0) > VARIES * deviation
                     part = replace(part, shift=np.where(varies, off / deviation, 0.0))
             parts.append(part)
-        parts = _named(parts, moved)
+        parts = _named(parts, moved, declared=policy.mapping.sees is not None)
         lasted = float(np.mean([len(one) for one in self.episodes])) * self.acting.period
         limits = _limits(np.array(self.actions), self.acting.outputs)
         return InputSheet(policy.name, tuple(parts), limits, min(lasted, float(steps)), steps)
@@ -424,8 +430,15 @@ def _at(values: Array, places: Array) -> Array:
     return np.broadcast_to(values, len(places)) if len(values) == 1 else values[places]
 
 
-def _named(parts: Sequence[InputPart], moved: Mapping[int, str]) -> list[InputPart]:
-    """Return the parts with what is far off about them."""
+def _named(
+    parts: Sequence[InputPart], moved: Mapping[int, str], *, declared: bool
+) -> list[InputPart]:
+    """Return the parts with what is far off about them.
+
+    Args:
+        moved: see ``_Seen.sheet``.
+        declared: ``sees`` says what they are; else nothing can be a little wrong.
+    """
     far = [_most(part.early) for part in parts]
     # A goal is what the user wants, and the last action is 0 at the start.
     own = [part.name not in ("Goal()", "LastAction()") for part in parts]
@@ -436,7 +449,7 @@ def _named(parts: Sequence[InputPart], moved: Mapping[int, str]) -> list[InputPa
         if far[k] > FAR and far[k] >= max(far) / 2:
             assert part.early is not None
             why = _off(part, int(part.early.argmax()))
-        elif max(far) <= FAR and not why:
+        elif declared and max(far) <= FAR and not why:
             if part.shift is not None and shifts[k] > SHIFTED:
                 why = _off(part, int(part.shift.argmax()))
             elif max(shifts) <= SHIFTED and (times := _times_smaller(parts, k)):
