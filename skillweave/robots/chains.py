@@ -16,6 +16,7 @@ from skillweave.errors import EnvError
 from skillweave.experience.play import SeededEpisodes, play
 from skillweave.policies.core import EPISODE, RUNNING, Array, Memory, RowPolicy, Step, Turn, part_of
 from skillweave.robots.aims import Aim
+from skillweave.robots.variation import with_settings
 from skillweave.skills.lengths import Lengths
 from skillweave.skills.skill_set import SkillSet, acting_policy, within
 
@@ -107,8 +108,7 @@ class OpenRobot:
         """Return the robot's environment: the open one where its settings are the same."""
         if self._engine is None or robot.settings != self._settings:
             self._close()
-            spec = replace(self._spec, kwargs={**self._spec.kwargs, **robot.settings})
-            self._engine = make_engine(spec, 1)
+            self._engine = make_engine(with_settings(self._spec, robot.settings), 1)
             self._settings = robot.settings
         return self._engine
 

@@ -20,7 +20,7 @@ from skillweave.policies.core import Array, Turn
 from skillweave.policies.mapped import Input, Mapped, Model, Outputs, Shapes
 from skillweave.robots.chains import OpenRobot, Robot
 from skillweave.robots.trial import robots_of
-from skillweave.robots.variation import Variation
+from skillweave.robots.variation import Variation, with_settings
 from skillweave.schema import AtLeastOne, fitted
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.ready import as_policy
@@ -60,6 +60,8 @@ AGAINST = 0.6
 """The share of outputs against which their numbers move, from which the sign is."""
 MOST_PULSES = 64
 """The most outputs that are tried."""
+NOT_OBSERVED = ("Goal()", "LastAction()")
+"""Parts that are no observation: what the user wants, and what the policy did."""
 AT_LIMIT = 0.2
 """The share of steps at the limit of the action from which an output is named."""
 
@@ -76,8 +78,8 @@ class InputPart:
         high: (numbers,) the highest.
         mean: (numbers,) of the training, that the model carries; None: it carries none.
         deviation: (numbers,) the same.
-        early: (numbers,) the root mean square of the first steps, in these deviations from that
-            mean, or of all steps, if that is less: a start may be unlike the rest; None: unknown.
+        distance: (numbers,) from that mean, in these deviations: the root mean square of the first
+            steps, or of all, if that is less, as a start may be unlike the rest; None: unknown.
         spread: (numbers,) the standard deviation in play, in deviations of the training; None.
         shift: (numbers,) how far the starts of episodes, and also play, are from the mean, in these
             deviations; 0 of what does not vary, or where starts differ too much to say; None.
@@ -91,7 +93,7 @@ class InputPart:
     high: Array
     mean: Array | None = None
     deviation: Array | None = None
-    early: Array | None = None
+    distance: Array | None = None
     spread: Array | None = None
     shift: Array | None = None
     why: str = ""
@@ -131,7 +133,7 @@ class InputSheet:
     def far(self) -> tuple[InputPart, ...]:
         """The parts that are far off, the farthest first."""
         found = [part for part in self.parts if part.why]
-        return tuple(sorted(found, key=lambda part: -_most(part.early)))
+        return tuple(sorted(found, key=lambda part: -_most(part.distance)))
 
     def to_json(self) -> dict[str, Any]:
         """Return it as plain JSON."""
@@ -192,7 +194,7 @@ class InputSheet:
                 _span(part.low, part.high),
                 "-" if part.mean is None else _span(part.mean, part.mean),
                 "-" if part.deviation is None else _span(part.deviation, part.deviation),
-                "-" if part.early is None else f"{_most(part.early):.1f}",
+                "-" if part.distance is None else f"{_most(part.distance):.1f}",
                 "far off" if part.why else "",
             ]
             for part in self.parts
@@ -259,7 +261,7 @@ def inputs(
     robots = robots_of(variation, fitted(int, seed, "seed"))
     first = next(robots)
     spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
-    spaces = EnvSpec(spec.env, {**spec.kwargs, **first.settings}, spec.wrappers).spaces
+    spaces = with_settings(spec, first.settings).spaces
     bound = found.bind(spaces.observation, spaces.action, "inputs()")
     if found.mapping.sees is None and spaces.observation.shape is None:
         raise DeclarationError(
@@ -322,7 +324,6 @@ class _Seen:
         self.model = _Shown(acting.model, acting.outputs.space.kind == "Box")
         self.acting = replace(acting, model=self.model, warn=None)
         self.columns = list(_columns(acting.inputs, policy.observation_space))
-        """By part: the input, its name, and the places in the flat input."""
         self.episodes: list[Array] = []
         """(T, K) each, what was shown."""
         self.outputs: list[Array] = []
@@ -355,58 +356,85 @@ class _Seen:
         starts = np.array([one[0] for one in self.episodes])
         reset, doubt = starts.mean(0), starts.std(0) / math.sqrt(len(starts))
         inside = policy.normalized()
-        parts, first = [], 0
-        for name, source, places in self.columns:
-            mine = slice(first, first + len(places))
-            first += len(places)
-            known = inside.get(name)
-            part = InputPart(
-                source, len(places), reset[mine], every[:, mine].min(0), every[:, mine].max(0)
-            )
-            if known is not None and len(known[0]) in (1, self._width(name)):
-                mean, deviation = (_at(x, places) for x in known)
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    part = replace(
-                        part,
-                        mean=mean,
-                        deviation=deviation,
-                        early=np.minimum(
-                            *(
-                                np.sqrt((((shown[:, mine] - mean) / deviation) ** 2).mean(0))
-                                for shown in (early, every)
-                            )
-                        ),
-                        spread=every[:, mine].std(0) / deviation,
-                    )
-                    off = np.minimum(
-                        np.abs(reset[mine] - mean) - SURE * doubt[mine],
-                        np.abs(every[:, mine].mean(0) - mean),
-                    )
-                    varies = every[:, mine].std(0) > VARIES * deviation
-                    part = replace(part, shift=np.where(varies, off / deviation, 0.0))
-            parts.append(part)
+        parts = []
+        for column in self.columns:
+            shown = every[:, column.own]
+            low, high = shown.min(0), shown.max(0)
+            part = InputPart(column.source, shown.shape[1], reset[column.own], low, high)
+            known = inside.get(column.input)
+            if known is not None and len(known[0]) in (1, self._width(column.input)):
+                mean, deviation = (_at(x, column.places) for x in known)
+                parts.append(
+                    _beside(part, mean, deviation, early[:, column.own], shown, doubt[column.own])
+                )
+            else:
+                parts.append(part)
         parts = _named(parts, moved, declared=policy.mapping.sees is not None)
         lasted = float(np.mean([len(one) for one in self.episodes])) * self.acting.period
         limits = _limits(np.array(self.actions), self.acting.outputs)
         return InputSheet(policy.name, tuple(parts), limits, min(lasted, float(steps)), steps)
 
     def _width(self, name: str) -> int:
-        return sum(len(places) for one, _, places in self.columns if one == name)
+        return sum(len(one.places) for one in self.columns if one.input == name)
 
 
-def _columns(
-    inputs: Mapping[str, Input] | None, observation_space: Any
-) -> Iterator[tuple[str, str, Array]]:
-    """Yield the input, the name and the places of each part."""
+def _beside(
+    part: InputPart, mean: Array, deviation: Array, early: Array, every: Array, doubt: Array
+) -> InputPart:
+    """Return a part with how it stands beside the mean and deviation of the training.
+
+    Args:
+        early: (T, numbers) of the first steps.
+        every: (T, numbers) of all.
+        doubt: (numbers,) the standard error of ``part.reset``.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, whole = (
+            np.sqrt((((shown - mean) / deviation) ** 2).mean(0)) for shown in (early, every)
+        )
+        spread = every.std(0) / deviation
+        off = np.minimum(np.abs(part.reset - mean) - SURE * doubt, np.abs(every.mean(0) - mean))
+        shift = np.where(spread > VARIES, off / deviation, 0.0)
+    return replace(
+        part,
+        mean=mean,
+        deviation=deviation,
+        distance=np.minimum(first, whole),
+        spread=spread,
+        shift=shift,
+    )
+
+
+@dataclass(frozen=True)
+class ShownPart:
+    """The numbers of a part among all that a policy is shown."""
+
+    input: str
+    """The name of the input."""
+    source: str
+    """What it is made of, for people."""
+    places: Array
+    """In the flat input."""
+    own: slice
+    """Among the numbers of all parts."""
+
+
+def _columns(inputs: Mapping[str, Input] | None, observation_space: Any) -> Iterator[ShownPart]:
+    """Yield the parts of what a policy is shown, in their order."""
     if inputs is None:
         size = math.prod(observation_space.shape or (1,))
-        yield "", "the observation", np.arange(size)
+        yield ShownPart("", "the observation", np.arange(size), slice(0, size))
         return
+    start = 0
     for name, one in inputs.items():
         first = 0
         for take in one.takes:
-            yield name, take.name + _places(take.places), np.arange(first, first + take.size)
+            places = np.arange(first, first + take.size)
+            yield ShownPart(
+                name, take.name + _places(take.places), places, slice(start, start + take.size)
+            )
             first += take.size
+            start += take.size
 
 
 def _places(places: tuple[int, ...] | None) -> str:
@@ -419,10 +447,10 @@ def _places(places: tuple[int, ...] | None) -> str:
     return f"[{', '.join(map(str, places[:3]))}{', ...' * (len(places) > 3)}]"
 
 
-def _flat(shown: Mapping[str, Array], columns: Sequence[tuple[str, str, Array]]) -> Array:
+def _flat(shown: Mapping[str, Array], columns: Sequence[ShownPart]) -> Array:
     """Return the numbers of one environment, in the order of the parts."""
     return np.concatenate(
-        [np.float64(shown[name][0]).reshape(-1)[places] for name, _, places in columns]
+        [np.float64(shown[one.input][0]).reshape(-1)[one.places] for one in columns]
     )
 
 
@@ -439,16 +467,16 @@ def _named(
         moved: see ``_Seen.sheet``.
         declared: ``sees`` says what they are; else nothing can be a little wrong.
     """
-    far = [_most(part.early) for part in parts]
+    far = [_most(part.distance) for part in parts]
     # A goal is what the user wants, and the last action is 0 at the start.
-    own = [part.name not in ("Goal()", "LastAction()") for part in parts]
+    own = [part.name not in NOT_OBSERVED for part in parts]
     shifts = [_most(part.shift) * mine for part, mine in zip(parts, own, strict=True)]
     found = []
     for k, part in enumerate(parts):
         why = moved.get(k, "")
         if far[k] > FAR and far[k] >= max(far) / 2:
-            assert part.early is not None
-            why = _off(part, int(part.early.argmax()))
+            assert part.distance is not None
+            why = _off(part, int(part.distance.argmax()))
         elif declared and max(far) <= FAR and not why:
             if part.shift is not None and shifts[k] > SHIFTED:
                 why = _off(part, int(part.shift.argmax()))
@@ -476,9 +504,9 @@ def _deviation(part: InputPart, place: int) -> float:
 def _times_smaller(parts: Sequence[InputPart], k: int) -> float:
     """Return how many times less a part varies than the others, in deviations; 0: it does not."""
     moving = {
-        i: (float(np.median(part.early)), float(np.median(part.spread)))
+        i: (float(np.median(part.distance)), float(np.median(part.spread)))
         for i, part in enumerate(parts)
-        if part.early is not None and part.spread is not None and part.name != "Goal()"
+        if part.distance is not None and part.spread is not None and part.name != "Goal()"
     }
     if k not in moving or len(moving) < FEW_PARTS:
         return 0.0
@@ -498,8 +526,11 @@ def _follows(seen: _Seen, where: OpenRobot, robot: Robot) -> dict[int, str]:
     """
     outputs = seen.acting.outputs
     count = outputs.count
-    same = {k: places for k, (_, name, places) in enumerate(seen.columns) if len(places) == count}
-    same = {k: x for k, x in same.items() if seen.columns[k][1] not in ("LastAction()", "Goal()")}
+    same = {
+        k: column.own
+        for k, column in enumerate(seen.columns)
+        if len(column.places) == count and column.source not in NOT_OBSERVED
+    }
     period, chunk = seen.acting.period, seen.acting.chunk
     looked = outputs.space.kind == "Box" and LEAST_OUTPUTS <= count <= MOST_PULSES
     if not looked or not same or period > 1 or chunk is not None:
@@ -507,7 +538,6 @@ def _follows(seen: _Seen, where: OpenRobot, robot: Robot) -> dict[int, str]:
     sizes = np.maximum(seen.outputs[0].std(0), 0.1)
     length = PULSE + 2
     plain = seen.play(where, robot, length, keep=False)
-    starts = np.cumsum([0, *(len(places) for _, _, places in seen.columns)])
     direct = {k: np.zeros((count, count)) for k in same}
     for place in range(count):
         seen.model.pulse = place, float(sizes[place])
@@ -515,9 +545,8 @@ def _follows(seen: _Seen, where: OpenRobot, robot: Robot) -> dict[int, str]:
         seen.model.pulse = None
         if len(shown) != len(plain):
             return {}
-        for k in same:
-            mine = slice(starts[k], starts[k] + count)
-            direct[k][place] = (shown - plain)[1:, mine].sum(0)
+        for k, own in same.items():
+            direct[k][place] = (shown - plain)[1:, own].sum(0)
     scale = np.ones(count) if outputs.scale is None else np.broadcast_to(outputs.scale, count)
     return {k: why for k in same if (why := _order(direct[k], np.sign(scale)))}
 
@@ -552,32 +581,35 @@ def _turns(seen: _Seen) -> dict[int, str]:
     A direction b (3,), gravity for example, that is seen in a body's frame turns by
     Δb = c b × w, where w (3,) is the body's angular velocity in the same frame.
     """
-    starts = np.cumsum([0, *(len(places) for _, _, places in seen.columns)])
-    threes = [k for k, (_, _, places) in enumerate(seen.columns) if len(places) == 3]
+    threes = {k: one for k, one in enumerate(seen.columns) if len(one.places) == 3}
     found = dict[int, str]()
-    for k in threes:
-        b = [one[:, starts[k] : starts[k] + 3] for one in seen.episodes]
+    for k, direction in threes.items():
+        b = [one[:, direction.own] for one in seen.episodes]
         if any(abs(np.linalg.norm(one, axis=1) - 1).max() > UNIT for one in b):
             continue
         moved = np.concatenate([np.diff(one, axis=0) for one in b])
-        middle = np.concatenate([(one[1:] + one[:-1]) / 2 for one in b])
+        middle = _middles(b)
         if not len(moved) or not moved.any():
             continue
         fits = dict[int, tuple[float, float, float]]()
-        for other in threes:
-            if other != k and seen.columns[other][1] not in ("Goal()", "LastAction()"):
-                w = [one[:, starts[other] : starts[other] + 3] for one in seen.episodes]
-                w_middle = np.concatenate([(one[1:] + one[:-1]) / 2 for one in w])
-                fits[other] = _explained(moved, middle, w_middle)
+        for other, column in threes.items():
+            if other != k and column.source not in NOT_OBSERVED:
+                w = _middles([one[:, column.own] for one in seen.episodes])
+                fits[other] = _explained(moved, middle, w)
         if any(here > TURNS and factor > 0 for here, factor, _ in fits.values()):
             continue  # it is the gyro
-        name = seen.columns[k][1]
+        name = direction.source
         for other, (here, factor, anywhere) in fits.items():
             if here > TURNS and factor < 0:
                 found[other] = f"it turns against {name}: its sign"
             elif anywhere > TURNS and here < ELSEWHERE:
                 found[other] = f"it does not turn as {name} does: it is in another frame"
     return found
+
+
+def _middles(episodes: Sequence[Array]) -> Array:
+    """Return the means of each two steps that follow one another, of all episodes."""
+    return np.concatenate([(one[1:] + one[:-1]) / 2 for one in episodes])
 
 
 def _explained(moved: Array, b: Array, w: Array) -> tuple[float, float, float]:

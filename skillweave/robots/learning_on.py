@@ -17,7 +17,7 @@ from skillweave.errors import DeclarationError
 from skillweave.policies.core import Array, Step
 from skillweave.robots.aims import Aim
 from skillweave.robots.trial import RobotTrial
-from skillweave.robots.variation import Variation
+from skillweave.robots.variation import Variation, with_settings
 from skillweave.skills import Residual, Skill
 
 BEGIN = 2_048
@@ -46,8 +46,7 @@ class Varied(gym.Env[Any, Any]):
         """Return the environment of a robot; it is made when it is first needed."""
         if number not in self._kinds:
             drawn = self._variation.draw(np.random.default_rng([number]))
-            spec = EnvSpec(self._spec.env, {**self._spec.kwargs, **drawn}, self._spec.wrappers)
-            self._kinds[number] = spec.make()
+            self._kinds[number] = with_settings(self._spec, drawn).make()
         return self._kinds[number]
 
     def reset(
@@ -91,8 +90,10 @@ def learn_on(
     if any(part is not None for part in trial.skills.parts):
         raise DeclarationError("repair() corrects whole actions: leave out acts and sees of skills")
     skills = [
-        declared(aim, policy, residual=scale if aim.skill.name == skill else None, reward=reward)
-        for aim, policy in zip(trial.aims, trial.skills.policies, strict=True)
+        declared(aim, policy, scale if aim.skill.name == skill else None, reward, max(most, cut))
+        for aim, policy, most, (_, cut) in zip(
+            trial.aims, trial.skills.policies, trial.steps, trial.cuts, strict=True
+        )
     ]
     spec = trial.spec
     if trial.variation.ranges:
@@ -106,7 +107,6 @@ def learn_on(
     hierarchy = Hierarchy(
         spec,
         skills,
-        call_steps=max(trial.steps),
         selector=lambda obs: [skill] * len(obs),
         steps=BEGIN,
         name=f"{skill}-after-{after}",
@@ -118,8 +118,14 @@ def learn_on(
     )
 
 
-def declared(aim: Aim, policy: Any, residual: Any, reward: Callable[[Step], Any]) -> Skill:
-    """Return a skill whose success is its aim; the one with a ``residual`` learns a correction."""
+def declared(
+    aim: Aim, policy: Any, residual: Any, reward: Callable[[Step], Any], most: int
+) -> Skill:
+    """Return a skill whose success is its aim; the one with a ``residual`` learns a correction.
+
+    Args:
+        most: the most steps of a call, unless the skill has such a limit.
+    """
     skill = aim.skill
     events = [event for event in (aim.stays, aim.done) if event is not None]
 
@@ -137,4 +143,6 @@ def declared(aim: Aim, policy: Any, residual: Any, reward: Callable[[Step], Any]
     made = copy.copy(skill)  # with its own starts, ends and limits
     made.__class__ = type(type(skill).__name__, (type(skill),), methods | {"name": skill.name})
     made.policy = policy if residual is None else Residual(policy, scale=residual)
+    if made.call_steps is None:
+        made.call_steps = most
     return made

@@ -207,8 +207,7 @@ class HandoverTable:
         Raises:
             DeclarationError: there is no such skill.
         """
-        some = self._of(START, self._known(skill))
-        return sum(entry.counts for entry in some), len(some)
+        return self._count(START, self._known(skill))
 
     def pair(self, after: str, skill: str) -> Pair:
         """Return the counts of a skill after another one.
@@ -332,12 +331,10 @@ class HandoverTable:
 
     def _picture(self) -> str:
         """Return the matrix as SVG."""
-
-        def count(after: str, skill: str) -> tuple[int, int] | None:
-            some = self._of(after, skill)
-            return None if after == skill else (sum(entry.counts for entry in some), len(some))
-
-        rows = [[count(after, name) for name in self.skills] for after in (START, *self.skills)]
+        rows = [
+            [None if after == skill else self._count(after, skill) for skill in self.skills]
+            for after in (START, *self.skills)
+        ]
         return matrix_svg(self.skills, rows)
 
     def sentences(self) -> list[str]:
@@ -406,9 +403,8 @@ class HandoverTable:
         for after in (START, *self.skills):
             cells = []
             for skill in self.skills:
-                some = self._of(after, skill)
-                done = sum(entry.counts for entry in some)
-                cells.append("-" if after == skill else f"{done} of {len(some)}")
+                done, every = self._count(after, skill)
+                cells.append("-" if after == skill else f"{done} of {every}")
             rows.append([after, *cells])
         return rows
 
@@ -442,6 +438,11 @@ class HandoverTable:
 
     def _of(self, after: str, skill: str) -> list[Entry]:
         return self._cells.get((after, skill), [])
+
+    def _count(self, after: str, skill: str) -> tuple[int, int]:
+        """Return the entries of a skill after another one that count, and all of them."""
+        some = self._of(after, skill)
+        return sum(entry.counts for entry in some), len(some)
 
     def _pair(self, after: str, skill: str) -> Pair:
         """Return the counts of a pair, from its entries and the fresh starts of their robots."""

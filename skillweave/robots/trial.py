@@ -20,7 +20,7 @@ from skillweave.hierarchy.fitting import check_settings, ready_policies
 from skillweave.hierarchy.roles import roles_of
 from skillweave.robots.aims import Aim, aims_of
 from skillweave.robots.chains import ChainPlayer, OpenRobot, PlannedCall, Robot
-from skillweave.robots.variation import Variation
+from skillweave.robots.variation import Variation, with_settings
 from skillweave.schema import AtLeastOne, fitted
 from skillweave.skills import Skill
 from skillweave.skills.skill_set import SkillSet, skills_below
@@ -102,9 +102,8 @@ def make_trial(
     variation = Variation({} if vary is None else vary)
     spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
     seed = fitted(int, seed, "seed")
-    example = variation.draw((Seeds(seed) / "robots" / 0 / "settings").numpy())
-    declared = EnvSpec(spec.env, {**spec.kwargs, **example}, spec.wrappers)
-    ready = _skill_set(declared, skills)
+    first = next(robots_of(variation, seed))
+    ready = _skill_set(with_settings(spec, first.settings), skills)
     most = _steps_of(steps, [skill.name for skill in ready.skills])
     aims = aims_of(ready.skills, stays, done, follows)
     return RobotTrial(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from skillweave._internal.messages import short
+from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.schema import fitted
 
@@ -34,6 +36,11 @@ class Variation:
 
     def __str__(self) -> str:
         return ", ".join(f"{name} {_words(values)}" for name, values in self.ranges.items())
+
+
+def with_settings(spec: EnvSpec, settings: Mapping[str, Any]) -> EnvSpec:
+    """Return an environment with the keywords that were drawn for a robot."""
+    return replace(spec, kwargs={**spec.kwargs, **settings})
 
 
 def _check(name: str, values: Any) -> None:

@@ -273,8 +273,12 @@ class PolicyMapping:
         return [source for source in self.sources() if isinstance(source, Goal)]
 
     def __post_init__(self) -> None:
-        kinds: dict[str, Any] = {"goal": GoalValue, "every": _Steps, "chunk": _Steps | None}
-        kinds["anew"] = tuple[Anew, ...]
+        kinds: dict[str, Any] = {
+            "goal": GoalValue,
+            "every": _Steps,
+            "chunk": _Steps | None,
+            "anew": tuple[Anew, ...],
+        }
         for name, kind in kinds.items():
             object.__setattr__(self, name, fitted(kind, getattr(self, name), name))
         kept = {

@@ -72,18 +72,19 @@ def test_what_is_repaired_is_what_was_measured(tmp_path: Path) -> None:
 
     found = sw.handovers(Balancer, [Fast(), Wave()], steps=60, stays=up, calls=2, quiet=True)
     fast, wave = (
-        declared(aim, policy, residual, upright)
+        declared(aim, policy, residual, upright, 70)
         for aim, policy, residual in zip(
             found.trial.aims, found.trial.skills.policies, (None, 0.5), strict=True
         )
     )
     assert (fast.name, fast.fade, wave.name, wave.fade) == ("fast", 5, "wave", None)
+    assert (fast.call_steps, wave.call_steps) == (70, 70)
     assert fast.defines("termination")
     assert wave.defines("initiation")
     assert wave.defines("success")
     assert wave.defines("reward")
     with pytest.raises(DeclarationError, match="fade"):
-        declared(found.trial.aims[0], skills["fast"], 0.5, upright)
+        declared(found.trial.aims[0], skills["fast"], 0.5, upright, 70)
 
 
 def test_episodes_of_training_are_each_of_a_robot_that_was_drawn() -> None:
