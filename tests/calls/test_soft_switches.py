@@ -89,6 +89,12 @@ def drawn(seed: int) -> list[Drawn]:
     return [skill(name) for name in NAMES]
 
 
+def between(before: Array, action: Array, share: float) -> Array:
+    """Return ``share`` of an action (3,), and the rest of the one before."""
+    mixed = share * action.astype(np.float64) + (1 - share) * before.astype(np.float64)
+    return mixed.astype(np.float32)
+
+
 class Alone:
     """A skill's policy in one environment, with its memory."""
 
@@ -124,9 +130,9 @@ class Alone:
             self.left = skill.ramp if executed is not None else 0
             self.origin = executed
         if self.left > 0:
-            share = np.float64((skill.ramp - self.left + 1) / skill.ramp)
+            share = (skill.ramp - self.left + 1) / skill.ramp
             if share < 1:
-                action = (share * action + (1 - share) * self.origin).astype(np.float32)
+                action = between(self.origin, action, share)
             self.left -= 1
         return action
 
@@ -160,10 +166,10 @@ class Plain:
         if self.before >= 0:
             self.faded += 1
             steps = self.skills[self.running].fades(self.skills[self.before].name)
-            share = np.float64(self.faded / steps)
+            share = self.faded / steps
             if share < 1:
                 theirs = self.alone[self.before].act(obs, self.executed)
-                action = (share * action + (1 - share) * theirs).astype(np.float32)
+                action = between(theirs, action, share)
                 self.seen["fade"] += 1
                 self.seen["both"] += bool(skill.left)
             else:
