@@ -30,6 +30,7 @@ from skillweave.api.applying import (
     load_policy,
     spec_of,
 )
+from skillweave.api.learnt_file import learnt_file
 from skillweave.api.notebook_tables import declared_html, declared_line, run_html
 from skillweave.api.player import Player
 from skillweave.api.push_pull import push_run
@@ -73,6 +74,7 @@ from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.video import Film, render_policy
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import write_bytes
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.runs.manifest import LevelEntry, manifest_in
 from skillweave.runs.trackers import track_film
@@ -508,7 +510,7 @@ class Hierarchy(Trainable, Declaration):
                 attributes["call_steps"] = entry.call_steps
             if entry.fade is not None:
                 attributes["fade"] = entry.fade
-            attributes |= part_from_json(entry.sees, entry.acts)
+            attributes |= part_from_json(entry.sees, entry.acts, entry.learns_on)
             rests[level] = rests.get(level, ZERO) if entry.rest is None else entry.rest
             if entry.hierarchy is not None:
                 attributes["policy"] = cls._recorded(
@@ -1000,6 +1002,32 @@ class Run(TrainedPolicy):
             return path
         assert isinstance(self.policy, HierarchyPolicy)
         write_weights(path, roles_of(self.hierarchy), self.policy, self.hierarchy.recipe)
+        return path
+
+    @checked_names
+    def save_onnx(self, skill: str, path: str | Path) -> Path:
+        """Write the ONNX file from which a skill learnt on, with the weights that it has now.
+
+        The skill's policy is ``from_onnx(..., learn=True)``. Inputs, outputs, names, shapes, opset
+        and metadata stay as they are, also outputs that are not of the policy: what runs the old
+        file runs the new one, with the same mapping. Its action is the skill's greedy one. Where
+        ``goal=`` is fixed, the policy has learnt for this goal, and others may act otherwise.
+
+        Args:
+            skill: the skill's path: ``walk``, or ``inner/walk`` in a hierarchy that is a skill.
+            path: the file to write.
+
+        Returns:
+            The path.
+
+        Raises:
+            DeclarationError: no such skill, or one that did not learn on from an ONNX file.
+            RunError: the run is a file of weights, or its copy of the ONNX file is damaged.
+        """
+        path = as_path(path, "path")
+        content = learnt_file(self.path, roles_of(self.hierarchy), self.policy, skill)
+        must_be_own(path.parent)
+        write_bytes(path, content)
         return path
 
     @checked_names

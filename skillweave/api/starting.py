@@ -107,6 +107,11 @@ def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: Manifes
         raise DeclarationError(
             f"start_from: {origin.name} acts in an environment, and {name!r} does not learn that"
         )
+    if origin.file is not None and (role.skill is None or role.skill.policy is not origin):
+        raise DeclarationError(
+            f"start_from: {origin.name} learns on with sees and acts of its own, which only a "
+            "skill has: write it as the skill's policy, policy = sw.from_onnx(..., learn=True)"
+        )
     goals = None if role.skill is None else role.skill.goal_space
     origin.check(role.observation_space, role.action_space, goals, f"start_from: {name!r}")
     first = next(stage for stage in content.stages if name in stage.learns)
@@ -124,7 +129,9 @@ def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: Manifes
         )
     algorithm = make_algorithm(config, role.observation_space, role.action_space)
     fresh = algorithm.weights(algorithm.init([Seeds(content.seed) / name / "start"]))
-    weights = {k: torch.from_numpy(v) for k, v in origin.weights(role.action_space).items()}
+    goal = None if role.part is None else role.part.goal_columns
+    given = origin.weights(role.action_space, goal)
+    weights = {k: torch.from_numpy(v) for k, v in given.items()}
     wrong = [k for k, v in weights.items() if k not in fresh or fresh[k].shape != v.shape]
     if wrong:
         raise PolicyError(
@@ -265,7 +272,7 @@ def _check_start(role: Role, algorithm: Algorithm, content: Manifest, learnt: Le
     if what:
         raise RunError(cannot + what)
     entry = content.by_path.get(role.path)
-    for field in ("sees", "acts", "residual"):
+    for field in ("sees", "acts", "residual", "learns_on"):
         then = getattr(learnt.entry or entry, field, None)
         now = getattr(entry, field, None)
         if entry is not None and then != now:

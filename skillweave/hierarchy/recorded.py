@@ -10,10 +10,10 @@ from skillweave.errors import RunError
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.policies.untrusted import shown
 from skillweave.runs.manifest import GuideEntry, LevelEntry, SkillEntry
-from skillweave.skills.foreign_policy import source_of
+from skillweave.skills.foreign_policy import Source, source_of
 from skillweave.skills.goals import goals_of
 from skillweave.skills.lengths import Lengths
-from skillweave.skills.own_part import part_to_json
+from skillweave.skills.own_part import file_of, part_to_json
 from skillweave.skills.residual import Residual
 from skillweave.spaces import space_to_json
 
@@ -31,6 +31,8 @@ def skill_entries(roles: Roles, ready: Mapping[str, Policy]) -> list[SkillEntry]
 def _skill_entry(roles: Roles, path: str, policy: Policy | None) -> SkillEntry:
     """Return a skill's entry for ``run.json``; ``policy`` is ready, or the skill corrects it."""
     skill = roles.skills[path]
+    file = file_of(skill)
+    source = None if file is None else Source(**file.source())
     goals_of(skill)  # a space that is not supported is named with its skill
     return SkillEntry(
         path,
@@ -39,7 +41,7 @@ def _skill_entry(roles: Roles, path: str, policy: Policy | None) -> SkillEntry:
         call_steps=skill.call_steps,
         fade=skill.fade,
         goal_space=None if skill.goal_space is None else space_to_json(skill.goal_space),
-        policy=None if policy is None else source_of(policy),
+        policy=source if policy is None else source_of(policy),
         hierarchy=level_entry(roles, roles.levels[path]) if path in roles.levels else None,
         **part_to_json(skill, roles[path].rest, f"skill {path!r}"),
     )
@@ -123,7 +125,7 @@ def check_same_part(roles: Roles, entry: SkillEntry, where: str) -> None:
     """
     path = entry.name
     declared = part_to_json(roles.skills[path], roles[path].rest, f"skill {path!r}")
-    for field in ("sees", "acts", "rest", "residual"):
+    for field in ("sees", "acts", "rest", "residual", "learns_on"):
         then = getattr(entry, field)
         now = declared.get(field)
         if then != now:

@@ -33,9 +33,9 @@ from skillweave.experience.judges import Sharing
 from skillweave.hierarchy.settings import Settings
 from skillweave.runs.user_code import Texts, environment_texts, skill_texts
 from skillweave.skills import ReadySelector, Skill, is_trained, ready_selector
-from skillweave.skills.learnable import Learnable
+from skillweave.skills.learnable import Learnable, NetworkFile
 from skillweave.skills.lengths import Lengths
-from skillweave.skills.own_part import OwnPart, declared_sees
+from skillweave.skills.own_part import OwnPart, declared_sees, file_of
 from skillweave.skills.residual import Residual
 from skillweave.skills.skill_set import LimitedCalls, SkillSet
 from skillweave.training.role import Role
@@ -142,7 +142,9 @@ class Level(LimitedCalls, Settings):
             return False
         skills = self.skills.values()
         seen = (declared_sees(s.sees, s.name) for s in skills if s.sees is not None)
-        computes = any(mapping.functions() for mapping in seen)
+        files = (file_of(skill) for skill in skills)
+        learns_on = (file.mapping for file in files if file is not None)
+        computes = any(mapping.functions() for mapping in (*seen, *learns_on))
         asks = any(s.defines("termination") or s.defines("initiation") for s in skills)
         return not (asks or computes)
 
@@ -353,6 +355,11 @@ class Roles:
             for path, part in parts.items()
             if part is not None and part.base is not None
         }
+
+    def files(self) -> dict[str, NetworkFile]:
+        """Return the files from which skills learn on, by the paths of these."""
+        files = {path: file_of(skill) for path, skill in self.skills.items()}
+        return {path: file for path, file in files.items() if file is not None}
 
     def changed(self, change: Callable[[Level], Level]) -> Roles:
         """Return the table with each level replaced by ``change`` of it."""

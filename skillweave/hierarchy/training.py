@@ -22,7 +22,7 @@ from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.command_words import repair_words, resume_words
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.initial_policies import copy_ready_policy, policy_at_start
+from skillweave.runs.initial_policies import copy_file, copy_ready_policy, policy_at_start
 from skillweave.runs.manifest import Manifest
 from skillweave.runs.trackers import Listener
 from skillweave.skills import ready_policy
@@ -115,6 +115,8 @@ def train(
     policies: Policies = _ready(roles, run)
     for path, policy in {**policies, **roles.bases()}.items():
         copy_ready_policy(run, path, policy)
+    for path, file in roles.files().items():
+        copy_file(run, path, file.content)
     budgets = budgets_of(roles)
     for level in roles.trained:
         # What has learnt together so far may have decided whether skills sample.

@@ -388,6 +388,17 @@ class Outputs:
         choice = self._decoded(output, n, self._chosen, self.allowed(mask), turn)
         return (self._to[choice] + space.bounds[0]).astype(space.dtype), None
 
+    def read(self, action: Array) -> Array:
+        """Return outputs (n, count), not clipped, that lead to real actions (n, …)."""
+        numbers = action.reshape(len(action), -1).astype(np.float64)
+        numbers = numbers if self._to is None else numbers[:, self._to]
+        if self.offset is not None:
+            numbers = numbers - self.offset
+        if self.scale is not None:
+            scale = np.broadcast_to(self.scale, numbers.shape)
+            numbers = np.divide(numbers, scale, out=0.0 * numbers, where=scale != 0.0)
+        return numbers.astype(np.float32)
+
     def _decoded(self, output: Any, n: int, space: Space, mask: Array | None, turn: Turn) -> Array:
         """Return actions for what is actions, or for logits."""
         if not self.logits:

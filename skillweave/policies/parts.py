@@ -12,7 +12,7 @@ import numpy as np
 
 from .acting_errors import PolicyError, SkillError
 from .core import Around, Array, Memory, RowPolicy, Step, Turn, World, call_plainly, code, observed
-from .mapped import Input, check_places
+from .mapped import Input, Outputs, check_places
 from .spaces import Space, allows_each, at
 
 OBSERVATION, GOAL = "observation", "goal"
@@ -162,6 +162,9 @@ class Slice:
     the last action where it writes nothing."""
     view: Callable[[Array], Array] | None = None
     """Returns the environment's observations of larger ones; None: they are not larger."""
+    outputs: Outputs | None = None
+    """The skill's own actions are the outputs of a file's network, and this is their meaning as
+    actions. None: they are actions."""
     who: str = "the skill"
     """Begins messages."""
 
@@ -179,6 +182,11 @@ class Slice:
             if [prod(x.shape) for x in self.inputs.values()] != [*map(prod, shapes.values())]:
                 raise PolicyError(f"Part.sees is {self.sees}, which does not fit Part.inputs")
         self._all = places is None and not self.paths
+        outputs = self.outputs
+        if outputs is not None and (
+            not self._all or not outputs.space.is_like(space) or (outputs.count,) != own.shape
+        ):
+            raise PolicyError(f"Part.outputs are of {outputs.space}, not of {own} as {space}")
         self._one = space.kind == "Discrete"
         if places is not None:
             size = sum(space.counts) if self._one else prod(space.shape)
@@ -309,6 +317,8 @@ class Slice:
             last: (n, …), the last actions; needed only where it ``holds``.
         """
         space = self.space
+        if self.outputs is not None:
+            return self.outputs(own, len(own), None, Turn(World()))[0]
         if self._all:
             return own
         if self._one:
@@ -322,7 +332,9 @@ class Slice:
         return action
 
     def read(self, action: Array) -> Array:
-        """Return its part of whole actions (n, …)."""
+        """Return its part of whole actions (n, …); outputs that lead to them."""
+        if self.outputs is not None:
+            return self.outputs.read(action)
         if self._all:
             return action
         if self._one:

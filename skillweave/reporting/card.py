@@ -104,7 +104,8 @@ def _use(run: RunDirectory, name: str) -> str:
         "comes with them.",
     ]
     skills = run.manifest.skills
-    if stays := [s for s in skills if s.policy is not None and s.policy.kind == "onnx"]:
+    ready = (s for s in skills if s.learns_on is None and s.policy is not None)
+    if stays := [s for s in ready if s.policy is not None and s.policy.kind == "onnx"]:
         names = ", ".join(text(s.name) for s in stays)
         lines += ["", f"Not here: the ONNX files of {names}, which the hierarchy must bring."]
     return "\n".join(lines)

@@ -15,7 +15,7 @@ from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy
 from skillweave.algorithms.base import Algorithm
 from skillweave.errors import DeclarationError, RunError
-from skillweave.policies.untrusted import read_file
+from skillweave.policies.untrusted import checksum, read_file
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import (
@@ -180,6 +180,38 @@ def copy_ready_policy(run: RunDirectory, skill: str, policy: Policy) -> None:
             run.check()
             make_directory(path.parent)
             write_bytes(path, content, make_directories=False)
+
+
+def copy_file(run: RunDirectory, skill: str, content: bytes) -> None:
+    """Copy the file from which a skill learns on into the run, if it is the one recorded there."""
+    path = file_path(run.path, skill)
+    recorded = run.manifest.by_path[skill].policy
+    right = recorded is not None and recorded.sha256 == checksum(content)
+    if right and not path.exists():  # a resumed run has it
+        run.check()
+        make_directory(path.parent)
+        write_bytes(path, content, make_directories=False)
+
+
+def file_at_start(run: RunDirectory, skill: str) -> bytes:
+    """Return a run's copy of the file from which a skill has learnt on.
+
+    Raises:
+        RunError: the copy is missing or damaged.
+    """
+    path = file_path(run.path, skill)
+    if not path.exists():
+        raise RunError(f"{path} is missing: it is the run's copy of the file of {skill!r}")
+    content = read_file(path)
+    recorded = run.manifest.by_path[skill].policy
+    if recorded is None or checksum(content) != recorded.sha256:
+        raise RunError(f"{path} is damaged: another checksum than the file of {skill!r} had")
+    return content
+
+
+def file_path(run: Path, skill: str) -> Path:
+    """Return the path of a run's copy of the file from which a skill learns on."""
+    return run / "policies" / f"{file_name(skill)}.onnx"
 
 
 def policy_at_start(run: RunDirectory, skill: str, policy: Policy) -> Policy:

@@ -121,6 +121,9 @@ class SkillEntry:
     """The other numbers of the action."""
     residual: Any = None
     """The scale of a correction of ``policy``, which is ready, where the skill learns one."""
+    learns_on: Any = None
+    """The mapping of a file from which the skill learns on, and the names of its input and output;
+    ``policy`` is the file."""
     policy: Source | None = None
     hierarchy: LevelEntry | None = None
     """Its settings, if the skill is a hierarchy."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,10 @@ from gymnasium.spaces import Box
 
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.policies.core import Array
+from skillweave.policies.untrusted import checksum
+from skillweave.schema import fitted
 from skillweave.skills.goal_spaces import goal_part, other_goals
+from skillweave.skills.mapping import LastAction, PolicyMapping
 
 if TYPE_CHECKING:
     from torch import nn
@@ -27,8 +30,8 @@ PLAIN_PPO = {"squash_actions": False, "action_std": "parameter"}
 def learn_on(skill: str) -> str:
     """Return words on the way in which a skill with a ready policy can learn on."""
     return (
-        "write policy = from_sb3(..., learn=True), or from_torch's, if it is a network from "
-        "elsewhere; policy = Residual(policy) to learn a correction of its actions; if it is a "
+        "write policy = from_sb3(..., learn=True), from_onnx's or from_torch's, if it is a network "
+        "from elsewhere; policy = Residual(policy) to learn a correction of its actions; if it is a "
         f"skill of another run, leave out policy and call train(start_from={{{skill!r}: run}})"
     )
 
@@ -40,6 +43,94 @@ def no_mapping(who: str, given: str) -> str:
         "that it sees and writes are those of the skill's class, which learn on with it: write "
         "sees = ... and acts = ... there"
     )
+
+
+REFUSED: tuple[tuple[str, Callable[[PolicyMapping], bool], str], ...] = (
+    (
+        "sees has LastAction()",
+        lambda x: any(isinstance(source, LastAction) for source in x.sources()),
+        "let the environment observe its last action, and read it, Part('last_action')",
+    ),
+    ("every is given", lambda x: x.every > 1, "let the environment repeat an action"),
+    ("chunk is given", lambda x: x.chunk is not None, "let it learn a correction, Residual(...)"),
+    ("state is given", lambda x: bool(x.state), "let it learn a correction, Residual(...)"),
+    ("anew is given", lambda x: bool(x.anew), "it has nothing to begin anew: leave out anew"),
+    (
+        "acts has ramp",
+        lambda x: x.acts is not None and x.acts.ramp > 0,
+        "it learns to take over from another skill: leave out ramp",
+    ),
+    (
+        "acts has to or rest",
+        lambda x: x.acts is not None and (x.acts.to is not None or x.acts.rest is not None),
+        "it writes all numbers of the action, in their order: let the environment, or a wrapper, "
+        "take the policy's numbers alone",
+    ),
+)
+"""What the mapping of a file that learns on cannot have, as it acts by what it sees alone: words on
+it, a test, and advice."""
+
+
+def check_learns_on(mapping: PolicyMapping, who: str) -> None:
+    """Raise a DeclarationError where a mapping has what a file that learns on cannot have."""
+    for given, holds, advice in REFUSED:
+        if holds(mapping):
+            raise DeclarationError(
+                f"{who}: {given}, but a policy that learns on has no time or memory of its own, "
+                f"and writes whole actions: {advice}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkFile:
+    """A file whose network learns on, and the meaning of its input and output.
+
+    The skill's own part is the file's: it observes the network's input and acts by its output.
+    """
+
+    name: str
+    """The path of the file."""
+    output: str
+    """The name of the output in it."""
+    input: str
+    """The name of the input, and below its shape for one environment; None: any number."""
+    shape: tuple[int | None, ...]
+    squashes: bool
+    """The output is that of a last ``Tanh``."""
+    mapping: PolicyMapping
+    """Its mapping; ``scaling`` has the normalisation in the file."""
+    content: bytes = b""
+    """The whole file; empty: of a run that was loaded without its code."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all but the content as JSON, for runs."""
+        fields: dict[str, Any] = {
+            "output": self.output,
+            "input": self.input,
+            "shape": list(self.shape),
+            "mapping": self.mapping.to_json(),
+        }
+        return fields | ({"squashes": True} if self.squashes else {})
+
+    @classmethod
+    def from_json(cls, data: Any) -> NetworkFile:
+        """Return a file, without its content, as ``to_json`` wrote it.
+
+        Raises:
+            DeclarationError: a value is wrong, or needs a function.
+        """
+        fitted(Mapping[str, Any], data, "learns_on")
+        names = (fitted(str, data.get(k), f"learns_on.{k}") for k in ("output", "input"))
+        shape = fitted(tuple[int | None, ...], data.get("shape"), "learns_on.shape")
+        squashes = fitted(bool, data.get("squashes", False), "learns_on.squashes")
+        return cls(
+            "its file", *names, shape, squashes, PolicyMapping.from_json(data.get("mapping"))
+        )
+
+    def source(self) -> dict[str, Any]:
+        """Return the fields of its ``Source``."""
+        sha256 = {"sha256": checksum(self.content)} if self.content else {}
+        return {"kind": "onnx", "name": self.name, "file": self.name, **sha256}
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +160,62 @@ class Layers:
         bias = np.concatenate([self.biases[-1], other.biases[-1]])
         return replace(self, weights=(*self.weights[:-1], weight), biases=(*self.biases[:-1], bias))
 
+    def first(self, weight: Array, bias: Array) -> Layers:
+        """Return layers with another first one."""
+        return replace(self, weights=(weight, *self.weights[1:]), biases=(bias, *self.biases[1:]))
+
     def scaled(self, scale: Array, offset: Array) -> Layers:
         """Return layers whose outputs are ``(output - offset) / scale``."""
         last = self.weights[-1] / scale, (self.biases[-1] - offset) / scale
         return replace(
             self, weights=(*self.weights[:-1], last[0]), biases=(*self.biases[:-1], last[1])
         )
+
+
+@dataclass(frozen=True, eq=False)
+class GoalColumns:
+    """The goal among the inputs of a file's network, which the learner has elsewhere, or not at all.
+
+    A goal that never changes is no input of the learner: it is part of the first layer's bias. The
+    goal of a call comes after all other inputs, as it is; its scaling is part of the first layer.
+    """
+
+    places: Array
+    """(G,) its places in the file's input."""
+    scale: Array
+    """(G,) the input there is ``goal * scale + shift``."""
+    shift: Array
+    """(G,)"""
+    fixed: Array | None = None
+    """(G,) the input there, of a goal that never changes; None: each call has a goal."""
+
+    def fold(self, layers: Layers) -> Layers:
+        """Return the layers of the learner for those of the file."""
+        weight = layers.weights[0]
+        own, bias = np.delete(weight, self.places, axis=0), layers.biases[0]
+        goal = weight[self.places]
+        if self.fixed is not None:
+            return layers.first(own, bias + self.fixed @ goal)
+        joint = np.concatenate([own, goal * self.scale[:, None]])
+        return layers.first(joint, bias + self.shift @ goal)
+
+    def unfold(self, layers: Layers, before: Layers) -> Layers:
+        """Return the layers of the file for those of the learner, the inverse of ``fold``.
+
+        Args:
+            layers: of the learner.
+            before: of the file, whose weights stay where nothing was learnt.
+        """
+        weight = before.weights[0].copy()
+        learnt, bias = layers.weights[0], layers.biases[0]
+        others = np.delete(np.arange(len(weight)), self.places)
+        weight[others] = learnt[: len(others)]
+        if self.fixed is not None:
+            return layers.first(weight, bias - self.fixed @ weight[self.places])
+        counts = self.scale != 0.0
+        goal = learnt[len(others) :][counts] / self.scale[counts][:, None]
+        weight[self.places[counts]] = goal
+        return layers.first(weight, bias - self.shift @ weight[self.places])
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +232,7 @@ class Learnable:
         observation_space: None: the environment's.
         action_space: None: the environment's.
         settings: of the algorithm, which the networks need.
+        file: the file that the policy was read from, with its mapping; None: it has no mapping.
     """
 
     name: str
@@ -102,6 +244,7 @@ class Learnable:
     observation_space: Space[Any] | None = None
     action_space: Space[Any] | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    file: NetworkFile | None = None
 
     def __repr__(self) -> str:
         return f"<{self.name}, to learn on>"
@@ -126,6 +269,8 @@ class Learnable:
                 f"algorithm = sw.{self.kind}(...)"
             )
         nets = self.networks.values()
+        if not nets:  # of a run that was loaded without its code, and has learnt
+            return config
         shapes = [{"hidden": net.hidden, "activation": net.activation} for net in nets]
         changes: dict[str, Any] = {
             "network": shapes[0],
@@ -171,11 +316,21 @@ class Learnable:
         each = ((name, net.weights) for name, net in self.networks.items())
         return ", ".join(f"{k} {w[0].shape[-2]} to {w[-1].shape[-1]}" for k, w in each)
 
-    def weights(self, action_space: Space[Any]) -> dict[str, Array]:
-        """Return the arrays by the names of the algorithm's weights, float32."""
+    def weights(
+        self, action_space: Space[Any], goal: GoalColumns | None = None
+    ) -> dict[str, Array]:
+        """Return the arrays by the names of the algorithm's weights, float32.
+
+        Args:
+            action_space: of the learner's actions.
+            goal: the goal in the input of a file's network; None: it has none.
+        """
         from skillweave.spaces import action_codec
 
         networks = dict(self.networks)
+        if goal is not None:
+            first = next(iter(networks))
+            networks[first] = goal.fold(networks[first])
         log_std = self.log_std
         if self.env_units and isinstance(action_space, Box):
             low, span, bounded = action_codec(action_space).span

@@ -5,9 +5,10 @@ from __future__ import annotations
 import copy
 import math
 import re
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self, overload
 
 import numpy as np
 from gymnasium import Space
@@ -21,9 +22,12 @@ from skillweave.policies.mapped import OnnxFile, fits_shape
 from skillweave.policies.sessions import open_session
 from skillweave.policies.spaces import space_of
 from skillweave.policies.untrusted import check_file
+from skillweave.schema import fitted
 from skillweave.skills.foreign_policy import SEES
+from skillweave.skills.learnable import PLAIN_PPO, Learnable, NetworkFile, check_learns_on
 from skillweave.skills.mapped import MappedPolicy
-from skillweave.skills.mapping import PolicyMapping, mapping_of
+from skillweave.skills.mapping import PolicyMapping, Scaling, mapping_of
+from skillweave.skills.onnx_layers import read_network
 
 OTHER = re.compile(
     "(?<!q)(?<!q_)value|vf|critic|baseline|adv|std|sigma|var|entropy|log_?p|shape|size|version|"
@@ -118,15 +122,10 @@ class OnnxPolicy(MappedPolicy):
         after = dict(self.mapping.state).values()
         ranks: dict[tuple[bool, ...], list[str]] = {}
         for output in self._session.get_outputs():
-            name = output.name.lower()
             numbers = math.prod(n for n in output.shape[1:] if isinstance(n, int))
             rank = (
                 output.name in after,
-                OTHER.search(name) is not None,
-                ACTION.search(name) is None,
-                choices > 0 and "logit" not in name,
-                "deterministic" not in name,
-                name not in ("action", "actions"),
+                *_rank(output.name, choices > 0),
                 numbers != (choices if choices and "int" not in output.type else size),
             )
             ranks.setdefault(rank, []).append(output.name)
@@ -185,6 +184,54 @@ class OnnxPolicy(MappedPolicy):
         return policy
 
 
+def _rank(output: str, choices: bool) -> tuple[bool, ...]:
+    """Return how little an output is named like an action, or like logits of ``choices``."""
+    name = output.lower()
+    return (
+        OTHER.search(name) is not None,
+        ACTION.search(name) is None,
+        choices and "logit" not in name,
+        "deterministic" not in name,
+        name not in ("action", "actions"),
+    )
+
+
+@overload
+def from_onnx(
+    path: str | Path,
+    *,
+    output: str | None = None,
+    sees: Any = None,
+    goal: Any = None,
+    acts: Any = None,
+    every: int = 1,
+    chunk: int | None = None,
+    state: Any = None,
+    anew: Any = (),
+    observation_space: Any = None,
+    action_space: Any = None,
+    learn: Literal[False] = False,
+) -> OnnxPolicy: ...
+
+
+@overload
+def from_onnx(
+    path: str | Path,
+    *,
+    output: str | None = None,
+    sees: Any = None,
+    goal: Any = None,
+    acts: Any = None,
+    every: int = 1,
+    chunk: int | None = None,
+    state: Any = None,
+    anew: Any = (),
+    observation_space: Any = None,
+    action_space: Any = None,
+    learn: Literal[True],
+) -> Learnable: ...
+
+
 @checked_names
 def from_onnx(
     path: str | Path,
@@ -199,7 +246,8 @@ def from_onnx(
     anew: Any = (),
     observation_space: Any = None,
     action_space: Any = None,
-) -> OnnxPolicy:
+    learn: bool = False,
+) -> OnnxPolicy | Learnable:
     """Return an ONNX file as a skill's policy; the run keeps a copy of it.
 
     It takes a batch of observations, of any size or of one. Whole numbers that it returns are
@@ -209,6 +257,15 @@ def from_onnx(
     places and slices of its flat form, ``Part(...)`` with scale and offset, ``Goal()``,
     ``LastAction()``, and functions of observations that return (n, numbers). Of several inputs it
     has a list each, by name: ``{"obs": ("gyro", "joints"), "command": Goal()}``.
+
+    With ``learn=True`` the skill is trained by ``PPO``, and begins with the network in the file:
+    linear layers with one kind of nonlinearity between them, perhaps with a normalisation of the
+    input, and a last Tanh. Its actions begin as those of the file, through ``sees`` and ``acts``;
+    the critic and the deviation of actions (``PPO(action_std_init=...)``, in the unit of the file's
+    outputs) start afresh. ``acts`` is applied to sampled outputs. A fixed ``goal`` stays, and the
+    weights of its inputs with it. ``Run.save_onnx`` writes the result as the same file with other
+    weights. Such a policy has no time or memory of its own: ``LastAction()``, ``every``,
+    ``chunk``, ``state``, ``anew``, and ``ramp``, ``to`` and ``rest`` of ``Acts`` are refused.
 
     Args:
         path: the file; weights in a second file beside it are read, too.
@@ -228,13 +285,15 @@ def from_onnx(
             another skill's call all begins anew.
         observation_space: None: the environment's.
         action_space: None: the environment's.
+        learn: the skill learns on from the file.
 
     Returns:
-        The policy, for a skill's ``policy`` or ``evaluate``.
+        The policy, for a skill's ``policy`` or ``evaluate``; with ``learn=True`` for a skill's
+        ``policy``.
 
     Raises:
         RunError: the file does not exist.
-        PolicyError: it is not a model of one batch of observations.
+        PolicyError: it is not a model of one batch of observations, or cannot learn on.
         DeclarationError: an argument is wrong; the message names it.
         MissingExtra: the extra 'onnx' is not installed.
     """
@@ -244,6 +303,9 @@ def from_onnx(
             "from_onnx(): state gives shapes; name the inputs and outputs of the file: "
             "state={'h_in': 'h_out'}"
         )
+    fitted(bool, learn, "from_onnx(): learn")
+    if learn:
+        check_learns_on(mapping, f"from_onnx(learn=True): {path}")
     with needs_extra("an ONNX file", "onnx"):
         import onnx
         import onnx.numpy_helper
@@ -262,11 +324,54 @@ def from_onnx(
             raise PolicyError(f"{where} are damaged: {str(error)[:300]}") from error
         if array.dtype.kind == "f" and np.isnan(array).any():
             raise PolicyError(f"{where} hold NaN")
-    return OnnxPolicy(
-        model.SerializeToString(deterministic=True),
-        Path(path),
-        output,
-        observation_space,
-        action_space,
-        mapping,
+    data = model.SerializeToString(deterministic=True)
+    if learn:
+        names = [x.name for x in model.graph.output]
+        chosen = _chosen(names, str(path)) if output is None else output
+        return _learnable(data, str(path), chosen, mapping, observation_space, action_space)
+    return OnnxPolicy(data, Path(path), output, observation_space, action_space, mapping)
+
+
+def _chosen(names: list[str], path: str) -> str:
+    """Return the output that is named like an action.
+
+    Raises:
+        DeclarationError: no name is, or several are.
+    """
+    ranks = [_rank(name, choices=False) for name in names]
+    best = [name for name, rank in zip(names, ranks, strict=True) if rank == min(ranks)]
+    if len(best) == 1:
+        return best[0]
+    raise DeclarationError(
+        f"from_onnx(learn=True): {path} has the outputs {', '.join(names) or 'none'}; name the one "
+        f"that is the action, output={names[0] if names else ''!r}"
+    )
+
+
+def _learnable(
+    data: bytes,
+    path: str,
+    output: str,
+    mapping: PolicyMapping,
+    observation_space: Any,
+    action_space: Any,
+) -> Learnable:
+    """Return the network in a file, for a skill that learns on.
+
+    Raises:
+        PolicyError: the network is of another kind.
+    """
+    found = read_network(data, output, path)
+    if found.normalizes:
+        own = Scaling(offset=found.offset, scale=found.scale)
+        mapping = replace(mapping, scaling={"": own})
+    file = NetworkFile(path, output, found.input, found.shape, found.squashes, mapping, data)
+    return Learnable(
+        path,
+        "PPO",
+        {"actor": found.layers},
+        observation_space=observation_space,
+        action_space=action_space,
+        settings=PLAIN_PPO | {"squash_actions": found.squashes},
+        file=file,
     )

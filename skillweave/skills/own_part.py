@@ -27,8 +27,10 @@ from skillweave.policies.mapped import Input
 from skillweave.policies.parts import Correction, Slice
 from skillweave.policies.spaces import Space as Data, space_of
 from skillweave.schema import as_json
+from skillweave.skills.file_part import file_input, file_output
 from skillweave.skills.fit_mapping import fitted_inputs, places_in
 from skillweave.skills.foreign_policy import source_of
+from skillweave.skills.learnable import GoalColumns, Learnable, NetworkFile
 from skillweave.skills.mapping import (
     Acts,
     PolicyMapping,
@@ -102,6 +104,8 @@ def declared_acts(acts: Any, who: str) -> Any:
 def part_to_json(skill: Any, rest: Any, who: str) -> dict[str, Any]:
     """Return the part of a skill as JSON for runs, see ``OwnPart``; {}: it has none."""
     content: dict[str, Any] = {}
+    if (file := file_of(skill)) is not None:
+        content["learns_on"] = file.to_json()
     if skill.sees is not None:
         content["sees"] = declared_sees(skill.sees, who).to_json()["sees"]
     if skill.acts is not None:
@@ -112,13 +116,23 @@ def part_to_json(skill: Any, rest: Any, who: str) -> dict[str, Any]:
     return content
 
 
-def part_from_json(sees: Any, acts: Any) -> dict[str, Any]:
-    """Return the attributes ``sees`` and ``acts`` as ``part_to_json`` wrote them; None: has none.
+def file_of(skill: Any) -> NetworkFile | None:
+    """Return the file from which a skill learns on, which has a mapping; None: it has none."""
+    return skill.policy.file if isinstance(skill.policy, Learnable) else None
+
+
+def part_from_json(sees: Any, acts: Any, learns_on: Any = None) -> dict[str, Any]:
+    """Return the attributes of a skill as ``part_to_json`` wrote them; None: it has none.
+
+    They are ``sees``, ``acts``, and a ``policy`` without weights where it learnt on from a file.
 
     Raises:
         DeclarationError: a value is wrong, or needs a function.
     """
     attributes: dict[str, Any] = {}
+    if learns_on is not None:
+        file = NetworkFile.from_json(learns_on)
+        attributes["policy"] = Learnable(file.name, "PPO", {}, file=file)
     if sees is not None:
         inputs = PolicyMapping.from_json({"sees": sees}).sees or {}
         attributes["sees"] = inputs[""] if set(inputs) == {""} else inputs
@@ -314,8 +328,19 @@ class OwnPart:
         """The ready policy to whose actions its own are added; None: there is none."""
         self.correction: Correction | None = None
         """The correction that adds the skill's actions to those of the base policy."""
+        self.goal_columns: GoalColumns | None = None
+        """The goal in the input of the file from which the skill learns on; None: it has none."""
         how: dict[str, Any] = {}
+        file = file_of(skill)
+        if file is not None and (sees is not None or acts is not None):
+            given = " and ".join(k for k in ("sees", "acts") if getattr(skill, k) is not None)
+            raise DeclarationError(
+                f"{who} has {given}, but its policy {file.name} learns on with the sees and acts "
+                f"of from_onnx(): leave out {given} of the skill"
+            )
         try:
+            if file is not None:
+                how = self._fit_file(file)
             if sees is not None:
                 how = self._fit_sees(sees)
             if acts is not None:
@@ -342,6 +367,30 @@ class OwnPart:
         """Return the declaration of the part as JSON."""
         content = part_to_json(self._skill, self._rest, self.who)
         return content if self.base is None else content | {"policy": as_json(source_of(self.base))}
+
+    def _fit_file(self, file: NetworkFile) -> dict[str, Any]:
+        """Return the fields of ``Slice`` where the skill learns on from a file."""
+        from skillweave.spaces import same_space  # needs torch, which declaring does not
+
+        declared = self._skill.policy
+        whole = self.whole_observation_space, self.whole_action_space
+        for kind, mine, theirs in zip(
+            ("observation_space", "action_space"),
+            (declared.observation_space, declared.action_space),
+            whole,
+            strict=True,
+        ):
+            if mine is not None and not same_space(mine, theirs):
+                raise PolicyError(
+                    f"{self.who}: {file.name} has {kind} {mine}, but the environment has {theirs}"
+                )
+        found = file_input(file, whole[0], self._skill.goal_space, self.who)
+        self.goal_columns = found.goal
+        size = prod(found.own.shape)
+        self.observation_space = Box(-np.inf, np.inf, (size,), np.float32)
+        outputs, self.written_space = file_output(file, whole[1], self.who)
+        sees = space_of(self.observation_space)
+        return {"inputs": {"": found.own}, "sees": sees, "outputs": outputs}
 
     def _fit_sees(self, sees: Any) -> dict[str, Any]:
         """Return the fields ``inputs`` and ``sees`` of ``Slice``: the skill's own observations."""

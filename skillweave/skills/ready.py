@@ -19,7 +19,7 @@ from skillweave.skills.foreign_policy import fitted
 from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
 from skillweave.skills.goals import goals_of
 from skillweave.skills.outputs import parameters_of, required_arguments
-from skillweave.skills.own_part import OwnPart
+from skillweave.skills.own_part import OwnPart, file_of
 from skillweave.skills.residual import Residual, correction, refuse_skill
 from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
@@ -150,8 +150,8 @@ def fitted_to_skill(
 
 def has_part(skill: Skill) -> bool:
     """Return whether a skill's learner or policy has a part of observations or actions alone."""
-    corrects = isinstance(skill.policy, Residual)
-    return skill.sees is not None or skill.acts is not None or corrects
+    changed = isinstance(skill.policy, Residual) or file_of(skill) is not None
+    return skill.sees is not None or skill.acts is not None or changed
 
 
 def own_part(
