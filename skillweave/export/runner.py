@@ -3,6 +3,7 @@
     runner = Runner("lander-onnx", code={"engines off.condition": landed})
     runner.reset()                     # at the start of every episode
     action = runner.act(observation)   # at every step
+    action = runner.act(observation, skill="wave")  # by remote control, in place of the selector
 
 Python code is given by name; it receives observations in batches, (n, ...).
 """

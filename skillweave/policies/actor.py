@@ -9,8 +9,9 @@ from typing import Any, Literal
 import numpy as np
 
 from .acting_errors import DeclarationError, PolicyError
-from .core import Array, Memory, RowPolicy, Step, Turn, World
+from .core import RUNNING, Array, Memory, RowPolicy, Step, Turn, World, innermost
 from .floats import in_usual_floats
+from .hierarchy import CallAndReturn
 from .infos import batched_infos
 from .spaces import Space, allows_each, at
 
@@ -80,6 +81,7 @@ class Actor:
         reward: float = 0.0,
         info: Mapping[str, Any] | None = None,
         mask: Any = None,
+        skill: str | None = None,
     ) -> Any:
         """Return the action for one observation, as the environment takes it.
 
@@ -90,10 +92,15 @@ class Actor:
             mask: (A,) the actions that the environment allows, ``env.action_masks()`` for example;
                 of a Dict or Tuple also a dict or tuple of masks. None: the mask in ``info``, or the
                 observation's part ``action_mask``; else all.
+            skill: the skill of the outermost hierarchy that acts, in place of the selector's, for
+                a remote control. Another name than that of the running call starts a new call, and
+                so does the same name where the call has ended; else the call goes on. Its
+                ``initiation`` is not called, and of several lengths the longest counts. None: the
+                selector chooses where the running call has ended.
 
         Raises:
-            DeclarationError: the observation or the mask does not fit the policy; the message
-                names what does.
+            DeclarationError: the observation or the mask does not fit the policy, or there is no
+                such skill; the message names what does.
         """
         deployed = self._deployed
         choices = self._deployed.acts.counts
@@ -118,12 +125,39 @@ class Actor:
         turn = Turn(self._world, allowed, greedy=self._deterministic)
         if self._before is None:
             self._begin(seen)
+        if skill is not None:
+            self._call(skill)
         action = deployed.policy.act(self.memory, ROW, seen, turn)
         self._before = seen, action
         return deployed.acts.unpacked(action[0])
 
     def _begin(self, seen: Array) -> None:
         """Prepare the memory for an episode that starts in an observation (1, …)."""
+
+    def _call(self, skill: str) -> None:
+        """Let a skill's call go on, or start one, as the caller chooses it."""
+        hierarchy = innermost(self._deployed.policy)
+        if not isinstance(hierarchy, CallAndReturn):
+            raise DeclarationError(
+                f"act(): skill is {str(skill)[:100]!r}, but this policy has no skills to choose "
+                "from: leave it out"
+            )
+        names = [one.name for one in hierarchy.skills]
+        if skill not in names:
+            raise DeclarationError(
+                f"act(): skill is {str(skill)[:100]!r}; it must be one of "
+                f"{', '.join(map(repr, names))}"
+            )
+        number = names.index(skill)
+        if number in hierarchy.goals:
+            raise DeclarationError(
+                f"act(): skill {skill!r} has goals (goal_space), which only a selector gives: "
+                "leave out skill, or let it act alone, run.player(skill=..., goal=...)"
+            )
+        running = self.memory["skill"][0] == number and self.memory["end"][0] == RUNNING
+        if not running:
+            longest = (number + 1) * hierarchy.each - 1
+            hierarchy.begin(self.memory, ROW, np.array([longest]))
 
     def _seen(self, obs: Any) -> Array:
         """Return one observation as a batch of one."""

@@ -13,14 +13,12 @@ from gymnasium.spaces import Box
 from skillweave._internal.messages import short
 from skillweave.errors import PolicyError
 from skillweave.policies.core import Array
-from skillweave.policies.mapped import Affine, Input, Outputs, clipped, numbers_of
+from skillweave.policies.mapped import Affine, Input, Outputs, clipped
 from skillweave.policies.spaces import space_of
 from skillweave.skills.fit_mapping import fitted_inputs, fitted_outputs, for_model
-from skillweave.skills.foreign_policy import SEES, made_up
-from skillweave.skills.function_state import examples
+from skillweave.skills.foreign_policy import SEES
 from skillweave.skills.learnable import GoalColumns, NetworkFile
 from skillweave.skills.mapping import Acts, Computed, Goal, Part, PolicyMapping
-from skillweave.skills.outputs import of_numbers
 
 
 class BoundedGoal:
@@ -87,7 +85,7 @@ def file_input(
     if goal_space is not None:
         given["goal"] = (space_of(goal_space).size,)
     elif mapping.goal is not None:
-        given["goal"] = np.shape(mapping.goal)
+        given["goal"] = np.asarray(mapping.goal).shape
     inputs = fitted_inputs(mapping, space, who, given)
     (whole,) = for_model(inputs, {file.input: file.shape}, who).values()
     if not places:
@@ -109,7 +107,7 @@ def _whole(file: NetworkFile, space: Space[Any], who: str) -> PolicyMapping:
             f"{file.output!r} depends on {file.input!r} alone: give that one, sees=(...)"
         )
     (parts,) = sees.values()
-    scaling = {file.input: x for x in mapping.scaling.values()}
+    scaling = {file.input: mapping.scaling[""]} if mapping.scaling else {}
     return replace(mapping, sees={file.input: parts}, scaling=scaling)
 
 
