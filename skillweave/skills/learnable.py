@@ -31,8 +31,8 @@ def learn_on(skill: str) -> str:
     """Return words on the way in which a skill with a ready policy can learn on."""
     return (
         "write policy = from_sb3(..., learn=True), from_onnx's or from_torch's, if it is a network "
-        "from elsewhere; policy = Residual(policy) to learn a correction of its actions; if it is a "
-        f"skill of another run, leave out policy and call train(start_from={{{skill!r}: run}})"
+        "from elsewhere; policy = Residual(policy) to learn a correction of its actions; if it is "
+        f"a skill of another run, leave out policy and call train(start_from={{{skill!r}: run}})"
     )
 
 
@@ -120,12 +120,12 @@ class NetworkFile:
             DeclarationError: a value is wrong, or needs a function.
         """
         fitted(Mapping[str, Any], data, "learns_on")
-        names = (fitted(str, data.get(k), f"learns_on.{k}") for k in ("output", "input"))
+        output = fitted(str, data.get("output"), "learns_on.output")
+        source = fitted(str, data.get("input"), "learns_on.input")
         shape = fitted(tuple[int | None, ...], data.get("shape"), "learns_on.shape")
         squashes = fitted(bool, data.get("squashes", False), "learns_on.squashes")
-        return cls(
-            "its file", *names, shape, squashes, PolicyMapping.from_json(data.get("mapping"))
-        )
+        mapping = PolicyMapping.from_json(data.get("mapping"))
+        return cls("its file", output, source, shape, squashes, mapping)
 
     def source(self) -> dict[str, Any]:
         """Return the fields of its ``Source``."""
@@ -174,7 +174,7 @@ class Layers:
 
 @dataclass(frozen=True, eq=False)
 class GoalColumns:
-    """The goal among the inputs of a file's network, which the learner has elsewhere, or not at all.
+    """The goal among the inputs of a file's network; the learner has it last, or not at all.
 
     A goal that never changes is no input of the learner: it is part of the first layer's bias. The
     goal of a call comes after all other inputs, as it is; its scaling is part of the first layer.

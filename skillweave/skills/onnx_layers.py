@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -168,7 +169,7 @@ class _Graph:
             self._refuse(f"it has the nonlinearities {' and '.join(kinds_of)}")
         numbers = [self._numbers(step) for step in layers]
         weights, biases = [x for x, _ in numbers], [x for _, x in numbers]
-        if any(a.shape[1] != b.shape[0] for a, b in zip(weights, weights[1:], strict=False)):
+        if any(a.shape[1] != b.shape[0] for a, b in pairwise(weights)):
             self._refuse("its layers have sizes that do not follow each other")
         self._layers = layers
         self._part = slice(None)
@@ -340,8 +341,8 @@ class _Graph:
             array = self._onnx.numpy_helper.to_array(value) if is_tensor else np.asarray(value)
         if array is None or array.dtype.kind not in "fiu":
             return None
-        array = np.asarray(array, np.float64)
-        return array.T if turned else array
+        numbers: Array = np.asarray(array, np.float64)
+        return numbers.T if turned else numbers
 
     def _numbers(self, step: _Step) -> tuple[Array, Array]:
         """Return the weights (in, out) and the bias (out,) of a linear layer."""
