@@ -52,9 +52,11 @@ if TYPE_CHECKING:
     from skillweave.skills.lengths import Lengths as Lengths
     from skillweave.skills.mapping import (
         Acts as Acts,
+        Elapsed as Elapsed,
         Goal as Goal,
         LastAction as LastAction,
         Part as Part,
+        Table as Table,
     )
     from skillweave.training.defaults import TrainDefaults as TrainDefaults
     from skillweave.training.evaluation import evaluate as evaluate

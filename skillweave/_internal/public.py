@@ -23,7 +23,7 @@ PUBLIC = {
         "robots.measuring": "handovers",
         "skills": "Reflex Residual Skill from_function from_onnx from_sb3 from_torch tree",
         "skills.automaton": "Automaton",
-        "skills.mapping": "Acts Goal LastAction Part",
+        "skills.mapping": "Acts Elapsed Goal LastAction Part Table",
         "training.defaults": "TrainDefaults",
         "training.evaluation": "evaluate",
         "training.stage": "Together",

@@ -117,6 +117,11 @@ def _examples(policy: Mapped, space: gym.Space[Any]) -> dict[str, Tensor]:
 
 def _module_model(policy: Mapped, own: TorchPolicy, where: str) -> Mapped:
     """Return the model of a PyTorch module as an ONNX file, with its mapping."""
+    if own.buffers:
+        raise PolicyError(
+            f"{where} keeps its state in buffers ({', '.join(own.buffers)}), which cannot be "
+            "written as ONNX: let forward take the state and return the next one"
+        )
     space = own.observation_space
     given = _examples(policy, space)
     shapes = [tuple(1 if n is None else n for n in shape) for shape in own.mapping.state]

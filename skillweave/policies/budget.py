@@ -71,7 +71,9 @@ def _mapped(values: Values) -> int:
     states: int = sum(prod(shape) for shape, _ in values["model"].states)
     actions: int = min(values.get("chunk") or 1, LONGEST)
     numbers: int = 32 * states + 4 * actions * _bytes(values["outputs"].space)
-    return numbers
+    pasts = [one.past for one in (values.get("inputs") or {}).values() if one.past is not None]
+    numbers += sum(32 * past.length * past.width for past in pasts)
+    return numbers if values.get("sees") is None else numbers + 4 * _bytes(values["sees"])
 
 
 def _take(values: Values) -> int:

@@ -19,7 +19,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from . import actor, hierarchy, leaves, mapped, parts, plan, planned, selectors, spaces
+from . import actor, hierarchy, leaves, mapped, parts, plan, planned, selectors, spaces, timed
 from .acting_errors import PolicyError, RunError
 from .actor import Deployed
 from .archives import numbers_in, unzipped
@@ -49,7 +49,7 @@ LONGEST_TEXT = 4096
 """The most characters of a name."""
 MOST_SHOWN = 20
 """The most functions of the field ``code`` that a message lists."""
-ROOMS = (actor, hierarchy, leaves, mapped, parts, plan, planned, selectors, spaces)
+ROOMS = (actor, hierarchy, leaves, mapped, parts, plan, planned, selectors, spaces, timed)
 
 OTHERS = (parts.Given, parts.Viewed, plan.Near, selectors.Rule)
 """Types in these files that are never written."""

@@ -85,6 +85,21 @@ class Step:
             self.goal = read_only(self.goal)
 
 
+@dataclass(frozen=True)
+class InCall:
+    """The time of a call, for a function of a ready policy's ``sees`` that takes ``call``.
+
+    Time starts where the skill takes over; a skill that is called again at once goes on.
+    """
+
+    steps: Array
+    """(n,) int64, the steps since then, and ``entry`` more."""
+    start: Array
+    """(n, *obs_shape), the observations of that step."""
+    entry: int = 0
+    """The step at which the policy starts, of ``from_onnx(..., entry=)``."""
+
+
 def read_only(array: Array) -> Array:
     """Return a view that cannot be written to."""
     view = array.view()

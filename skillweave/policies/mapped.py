@@ -12,15 +12,22 @@ from typing import Any, Literal
 import numpy as np
 
 from .acting_errors import PolicyError
-from .core import Array, Memory, RowPolicy, Turn, World, code, read_only
+from .core import Array, InCall, Memory, RowPolicy, Turn, World, code, read_only
 from .sessions import open_session
 from .spaces import Space, at, discrete
+from .timed import Clock, Past, Rows
 
 Shapes = Mapping[str, tuple[int | None, ...] | None]
 """Shapes of a model's inputs for one environment, by name; None: unknown."""
 HERE = {"written": False}
 """Metadata of fields that serve messages; files do not contain them."""
-ANEW = {"state": "state", "last_action": "last", "held": "phase"}
+ANEW = {
+    "state": "state",
+    "last_action": "last",
+    "held": "phase",
+    "elapsed": "elapsed",
+    "history": "past",
+}
 """What may begin anew in each call, and its name in the memory."""
 UNKNOWN = -1
 """In place of the steps that are left of a ramp: it is not known yet whether there is one."""
@@ -51,10 +58,10 @@ class Take:
         PolicyError: its fields contradict each other.
     """
 
-    source: Literal["observation", "goal", "last_action", "function"]
+    source: Literal["observation", "goal", "last_action", "function", "time"]
     shape: tuple[int, ...]
-    """The shape for one environment, of the leaf, the goal, the last output, or the function's
-    result."""
+    """The shape for one environment, of the leaf, the goal, the last output, the function's
+    result, or the clock or table."""
     fields: tuple[str, ...] = ()
     """The names that lead to a leaf of the observation."""
     places: tuple[int, ...] | None = None
@@ -74,6 +81,10 @@ class Take:
     """Places among its numbers that it does not read: others drive them."""
     held_at: Array | None = None
     """(len(held),) what stands there."""
+    takes_call: bool = False
+    """The function has an argument ``call``."""
+    time: Clock | Rows | None = None
+    """The clock or the table that it reads."""
     who: str = field(default="a function", metadata=HERE)
     """Begins messages."""
 
@@ -109,24 +120,43 @@ class Take:
         self._held = np.array(self.held, np.int64)
         if self.source in ("goal", "last_action") and len(self.shape) != 1:
             raise PolicyError(f"Take.shape is {self.shape}, but a {self.source} is (numbers,)")
+        size = None if self.time is None else (self.time.size,)
+        if size != (self.shape if self.source == "time" else None):
+            raise PolicyError(f"Take.time is {self.time}, but Take.source is {self.source!r}")
+        if self.takes_call and self.function is None:
+            raise PolicyError("Take.takes_call is true, but there is no Take.function")
 
     @property
     def name(self) -> str:
         """The name of its source in messages."""
         if self.source == "observation":
             return ".".join(self.fields) or "the observation"
+        if self.source == "time":
+            return "Elapsed()" if isinstance(self.time, Clock) else "Table()"
         return {"goal": "Goal()", "last_action": "LastAction()"}.get(self.source, "a function")
 
-    def __call__(self, obs: Array, goal: Array | None, last: Array | None) -> Array:
+    @property
+    def timed(self) -> bool:
+        """It depends on the steps since the policy took over."""
+        return self.source == "time" or self.takes_call
+
+    def __call__(
+        self, obs: Array, goal: Array | None, last: Array | None, call: InCall | None
+    ) -> Array:
         """Return numbers (n, size), or (n, *shape) where it is whole or a function.
 
         Args:
             obs: (n, …).
             goal: (n, G), where it is taken.
             last: (n, K), the last outputs, where they are taken.
+            call: the time since the policy took over, where it counts.
         """
         if self.function is not None:
-            return numbers_of(self.function, obs, self.who, self.shape)
+            call = call if self.takes_call else None
+            return numbers_of(self.function, obs, self.who, self.shape, call)
+        if self.time is not None:
+            assert call is not None
+            return self.time(call.steps)
         if self.source == "last_action":
             assert last is not None
             return last
@@ -157,14 +187,22 @@ def _one_hot(choice: Array, count: int) -> Array:
 
 
 def numbers_of(
-    function: Callable[..., Any], obs: Array, who: str, shape: tuple[int, ...] | None = None
+    function: Callable[..., Any],
+    obs: Array,
+    who: str,
+    shape: tuple[int, ...] | None = None,
+    call: InCall | None = None,
 ) -> Array:
     """Return the numbers (n, ...) that a function makes for a model as it acts; (n,) as (n, 1).
+
+    Args:
+        call: given to the function, too; None: it does not take it.
 
     Raises:
         PolicyError: it returned something else, or another ``shape`` of one environment.
     """
-    values = np.asarray(function(read_only(obs)))
+    named = {} if call is None else {"call": call}
+    values = np.asarray(function(read_only(obs), **named))
     if values.shape[:1] != (len(obs),) or values.dtype.kind not in "iubf":
         raise PolicyError(
             f"{who} returned {values.dtype} of shape {values.shape}, but numbers of shape "
@@ -209,23 +247,49 @@ class Input:
     shape: tuple[int, ...]
     """The shape of the input for one environment."""
     scalings: tuple[Affine, ...] = ()
-    """Scalings of the input, applied in this order."""
+    """Scalings of what is taken, applied in this order."""
     reshaped: bool = False
     """It is brought to its shape: one number with or without an axis of its own."""
+    past: Past | None = None
+    """Its numbers are of this inference and of some before; None: of this one alone."""
+    last_scaling: Affine | None = None
+    """A scaling of the input with its past."""
 
     def __post_init__(self) -> None:
-        size = sum(take.size for take in self.takes)
+        taken = sum(take.size for take in self.takes)
+        size = taken if self.past is None else len(self.past.ages)
         if not self.takes or size != prod(self.shape):
             raise PolicyError(f"Input.shape is {self.shape}, but Input.takes gives {size} numbers")
+        if self.past is not None and self.past.width != taken:
+            raise PolicyError(f"Past.width is {self.past.width}, but Input.takes gives {taken}")
+        shape = self.shape if self.past is None else (taken,)
         for one in self.scalings:
-            _check_sizes(one, self.shape, "offset", "scale", "low", "high")
+            _check_sizes(one, shape, "offset", "scale", "low", "high")
+        if self.last_scaling is not None:
+            _check_sizes(self.last_scaling, (size,), "offset", "scale", "low", "high")
 
-    def __call__(self, obs: Array, goal: Array | None = None, last: Array | None = None) -> Array:
-        """Return the input (n, *shape) for observations (n, …); see ``Take``."""
-        values = [take(obs, goal, last) for take in self.takes]
+    def __call__(self, obs: Array) -> Array:
+        """Return the input (n, *shape) for observations (n, …), where it takes nothing else."""
+        return self.shaped(self.now(obs))
+
+    def now(
+        self,
+        obs: Array,
+        goal: Array | None = None,
+        last: Array | None = None,
+        call: InCall | None = None,
+    ) -> Array:
+        """Return what is taken for this inference, (n, …); see ``Take``."""
+        values = [take(obs, goal, last, call) for take in self.takes]
         x = values[0] if len(values) == 1 else np.concatenate(values, axis=1)
         for scaling in self.scalings:
             x = scaling(x)
+        return x
+
+    def shaped(self, x: Array) -> Array:
+        """Return the input (n, *shape) of its numbers, those of its past included."""
+        if self.last_scaling is not None:
+            x = self.last_scaling(x)
         return x.reshape(len(x), *self.shape) if self.reshaped else x
 
     def check(self, sees: Space, where: str) -> None:
@@ -475,6 +539,11 @@ class Model:
         """The shapes of its recurrent state of one environment, and their types."""
         return ()
 
+    @property
+    def first_states(self) -> Sequence[Array | None]:
+        """The values that its recurrent state starts with, of one environment; None: zeros."""
+        return [None] * len(self.states)
+
     def call(
         self, inputs: dict[str, Array], state: tuple[Array, ...], turn: Turn
     ) -> tuple[Any, Sequence[Array]]:
@@ -619,6 +688,8 @@ class OnnxFile(Model):
     """The names of its inputs, without those of its state."""
     state: tuple[tuple[str, str], ...] = ()
     """Names of the recurrent state: of each input, and of the output that is its next value."""
+    first: tuple[tuple[str, Array], ...] = ()
+    """Names of inputs of the state that do not start with zeros, and their first values."""
     who: str = field(default="the policy", metadata=HERE)
     """Begins messages."""
     session: Any = field(default=None, repr=False, metadata={"written": False})
@@ -651,6 +722,21 @@ class OnnxFile(Model):
                 raise PolicyError(
                     f"{self.who} takes {given.name} {given.type}{given.shape}; it must take one "
                     "batch of observations"
+                )
+        self._check_first()
+
+    def _check_first(self) -> None:
+        """Raise a PolicyError where a first value does not fit the state that starts with it."""
+        shapes = {
+            name: shape for (name, _), (shape, _) in zip(self.state, self.states, strict=True)
+        }
+        for name, value in self.first:
+            if name not in shapes:
+                raise PolicyError(f"{self.who}: OnnxFile.first has {name!r}, which is no state")
+            if np.ndim(value) and np.size(value) != prod(shapes[name]):
+                raise PolicyError(
+                    f"{self.who}: the first value of {name!r} has {np.size(value)} numbers, but "
+                    f"the state has the shape {shapes[name]}"
                 )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -704,6 +790,16 @@ class OnnxFile(Model):
             found.append((tuple(sizes), NUMBERS[self._given[name].type]))
         return found
 
+    @property
+    def first_states(self) -> Sequence[Array | None]:
+        """The values that its recurrent state starts with, of one environment; None: zeros."""
+        known = dict(self.first)
+        given = [known.get(name) for name, _ in self.state]
+        return [
+            x if x is None or not np.ndim(x) else np.reshape(x, shape)
+            for x, (shape, _) in zip(given, self.states, strict=True)
+        ]
+
     def call(
         self, inputs: dict[str, Array], state: tuple[Array, ...], turn: Turn
     ) -> tuple[Any, Sequence[Array]]:
@@ -753,7 +849,9 @@ class Mapped(RowPolicy):
     """A model behind a mapping, as a policy that acts.
 
     Its memory has, where the mapping needs them: ``state.0`` and following, the recurrent state;
-    ``last``, the last output; ``phase``, the steps since the last inference; ``held``, its actions.
+    ``last``, the last output; ``phase``, the steps since the last inference; ``held``, its actions;
+    ``elapsed.steps`` since it took over, and ``elapsed.start``, the observation then;
+    ``past.0`` and following, the last numbers of an input, and ``past.known``, that there are some.
 
     Raises:
         PolicyError: its fields contradict each other.
@@ -777,6 +875,10 @@ class Mapped(RowPolicy):
     """The steps, after another skill's, in which actions come from the last one; 0: none."""
     anew: tuple[str, ...] = ()
     """What begins anew where it is called again at once: of ``ANEW``."""
+    entry: int = 0
+    """The step at which its time starts, where it takes over."""
+    sees: Space | None = None
+    """The space of observations, where functions take the one at which it took over."""
     who: str = field(default="the policy", metadata=HERE)
     """Begins messages."""
     warn: Callable[[str], None] | None = field(default=None, repr=False, metadata=HERE)
@@ -819,6 +921,17 @@ class Mapped(RowPolicy):
                 f"{space}"
             )
         self._check_inputs()
+        self._timed = any(take.timed for take in self.takes)
+        if any(take.takes_call for take in self.takes) and self.sees is None:
+            raise PolicyError("Mapped.inputs has a function that takes call, but no Mapped.sees")
+        tables = [take.time.steps for take in self.takes if isinstance(take.time, Rows)]
+        self._over = min(tables, default=None)
+        """The step at which the first table is over."""
+        self._pasts = [
+            (f"past.{i}", one.past)
+            for i, one in enumerate((self.inputs or {}).values())
+            if one.past is not None
+        ]
         self._states = [(f"state.{i}", *one) for i, one in enumerate(self.model.states)]
         self._simple = self.inputs is None and not self._states and self.period == 1
         """It has no memory, and takes observations as they are."""
@@ -870,6 +983,8 @@ class Mapped(RowPolicy):
             )
         if not self.outputs.space.is_like(acts):
             raise PolicyError(f"{where}.outputs.space is {self.outputs.space}, not {acts}")
+        if self.sees is not None and not self.sees.is_like(sees):
+            raise PolicyError(f"{where}.sees is {self.sees}, but observations are of {sees}")
         own = self.goal_space
         if own is not None and (goal is None or not own.is_like(goal)):
             raise PolicyError(f"{where}.goal_space is {own}, but goals are of {goal}")
@@ -904,6 +1019,17 @@ class Mapped(RowPolicy):
     def start(self, n: int) -> Memory:
         """Return the memory of n environments in which it has not acted yet."""
         memory: Memory = {key: np.zeros((n, *shape), dtype) for key, shape, dtype in self._states}
+        for (key, _, _), value in zip(self._states, self.model.first_states, strict=True):
+            if value is not None:
+                memory[key][...] = value
+        if self._timed:
+            memory["elapsed.steps"] = np.full(n, self.entry)
+        if self.sees is not None:
+            memory["elapsed.start"] = np.zeros((n, *self.sees.shape), self.sees.record)
+        if self._pasts:
+            memory["past.known"] = np.zeros(n, bool)
+            for key, past in self._pasts:
+                memory[key] = np.zeros((n, past.length, past.width))
         if self._last:
             memory["last"] = np.zeros((n, self.outputs.count), np.float64)
         if self.period > 1:
@@ -926,7 +1052,10 @@ class Mapped(RowPolicy):
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return actions (k, …), of this inference or of an earlier one."""
-        action = self._acted(memory, rows, obs, turn)
+        if self._timed:
+            action = self._acted_in_time(memory, rows, obs, turn)
+        else:
+            action = self._acted(memory, rows, obs, turn)
         if self.ramp:
             action = self._ramped(memory, rows, action, turn.world)
         if self.warn is not None:
@@ -975,6 +1104,22 @@ class Mapped(RowPolicy):
             "allowed (initiation)"
         )
 
+    def _acted_in_time(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return actions (k, …) of the model, and count the step."""
+        elapsed = memory["elapsed.steps"][rows]
+        if self.sees is not None:
+            first = np.flatnonzero(elapsed == self.entry)
+            memory["elapsed.start"][rows[first]] = obs[first]
+        action = self._acted(memory, rows, obs, turn)
+        memory["elapsed.steps"][rows] = elapsed + 1
+        if self._over is not None and self.warn is not None and (elapsed > self._over).any():
+            self.warn(
+                f"{self.who}: its table was over at step {int(self._over)} of a call that goes on: "
+                "its last row stays. Let the call end there (call_steps), or give more rows"
+            )
+            self._over = None
+        return action
+
     def _acted(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return actions (k, …) of the model."""
         if self._simple:
@@ -1007,9 +1152,29 @@ class Mapped(RowPolicy):
         if self.inputs is not None:
             goal = None if self._goal_shape is None else self._aim(obs, turn)
             last = memory["last"][rows] if self._last else None
-            inputs = {name: one(obs, goal, last) for name, one in self.inputs.items()}
+            call = self._call(memory, rows) if self._timed else None
+            numbers = {name: one.now(obs, goal, last, call) for name, one in self.inputs.items()}
+            if self._pasts:
+                self._with_past(memory, rows, numbers)
+            inputs = {name: one.shaped(numbers[name]) for name, one in self.inputs.items()}
         before = tuple(memory[key][rows] for key, _, _ in self._states)
         return self.model.call(inputs, before, turn)
+
+    def _call(self, memory: Memory, rows: Array) -> InCall:
+        """Return the time since it took over."""
+        start = memory["elapsed.start"][rows] if self.sees is not None else np.zeros(len(rows))
+        return InCall(read_only(memory["elapsed.steps"][rows]), read_only(start), self.entry)
+
+    def _with_past(self, memory: Memory, rows: Array, numbers: dict[str, Array]) -> None:
+        """Replace the numbers of inputs that have a past by those with it, and remember them."""
+        assert self.inputs is not None
+        known = memory["past.known"][rows]
+        memory["past.known"][rows] = True
+        for i, (name, one) in enumerate(self.inputs.items()):
+            if one.past is not None:
+                kept = memory[f"past.{i}"][rows]
+                numbers[name] = one.past(kept, known, numbers[name])
+                memory[f"past.{i}"][rows] = kept
 
     def _inferred(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> list[Array]:
         """Return the next actions, (k, …) each."""

@@ -12,7 +12,7 @@ from gymnasium import Space
 
 from skillweave._internal.messages import short, shortened, suggest
 from skillweave.errors import PolicyError
-from skillweave.policies.core import Array
+from skillweave.policies.core import Array, InCall
 from skillweave.policies.mapped import (
     Affine,
     Input,
@@ -23,9 +23,19 @@ from skillweave.policies.mapped import (
     numbers_of,
 )
 from skillweave.policies.spaces import space_of
+from skillweave.policies.timed import Clock, Past, Rows
 from skillweave.skills.foreign_policy import made_up
 from skillweave.skills.function_state import examples
-from skillweave.skills.mapping import Acts, Goal, LastAction, Part, PolicyMapping, Source
+from skillweave.skills.mapping import (
+    Acts,
+    Elapsed,
+    Goal,
+    LastAction,
+    Part,
+    PolicyMapping,
+    Source,
+    Table,
+)
 from skillweave.skills.outputs import of_numbers
 
 # Inputs
@@ -43,7 +53,7 @@ def fitted_inputs(
     Raises:
         PolicyError: a part does not fit the space; the message names the field.
     """
-    reader = _Reader(space, own)
+    reader = _Reader(space, own, mapping.entry)
     inputs: dict[str, Input] = {}
     for name, parts in (mapping.sees or {}).items():
         field = f"{who}: {_field(name)}"
@@ -58,11 +68,57 @@ def fitted_inputs(
         width = sum(take.size for take in takes)
         keeps = len(takes) == 1 and (takes[0].whole or takes[0].source == "function")
         shape = takes[0].shape if keeps else (width,)
+        past = _past(parts, [size for _, size, _ in scaled])
+        if past is not None and keeps:
+            raise PolicyError(
+                f"{field} has history, but it keeps its shape {shape}: stack frames by a wrapper, "
+                "gymnasium.wrappers.FrameStackObservation"
+            )
         scalings = _scaling(scaled, shape)
-        if (last := mapping.scaling.get(name)) is not None:
+        last = mapping.scaling.get(name)
+        if past is not None:
+            size = len(past.ages)
+            whole = _scaling([(last, size, f"{who}: scaling")], (size,)) if last is not None else ()
+            last_scaling = whole[0] if whole else None
+            inputs[name] = Input(tuple(takes), (size,), scalings, False, past, last_scaling)
+            continue
+        if last is not None:
             scalings += _scaling([(last, width, f"{who}: scaling")], shape)
         inputs[name] = Input(tuple(takes), shape, scalings)
     return inputs
+
+
+def _past(parts: Sequence[Source], sizes: Sequence[int]) -> Past | None:
+    """Return the places of an input's numbers in the last inferences; None: it takes one alone.
+
+    Args:
+        sizes: of each part, in one inference.
+    """
+    lengths = [getattr(part, "history", 1) for part in parts]
+    if max(lengths) == 1:
+        return None
+    ends = np.cumsum(sizes)
+    columns = [np.arange(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    blocks = list[tuple[Any, Array]]()
+    for part, own in zip(parts, columns, strict=True):
+        joined = getattr(part, "layout", "term") == "step"
+        if joined and blocks and getattr(blocks[-1][0], "layout", "term") == "step":
+            blocks[-1] = part, np.concatenate([blocks[-1][1], own])
+        else:
+            blocks.append((part, own))
+    ages, places = list[Array](), list[Array]()
+    for part, own in blocks:
+        age = np.arange(getattr(part, "history", 1))
+        age = age if getattr(part, "order", "oldest") == "newest" else age[::-1]
+        ages.append(np.repeat(age, len(own)))
+        places.append(np.tile(own, len(age)))
+    zeros = [
+        own
+        for part, own in zip(parts, columns, strict=True)
+        if getattr(part, "fill", "first") == "zeros"
+    ]
+    first = tuple(np.concatenate(zeros).tolist()) if zeros else ()
+    return Past(np.concatenate(ages), np.concatenate(places), int(ends[-1]), first)
 
 
 def _field(name: str) -> str:
@@ -72,7 +128,8 @@ def _field(name: str) -> str:
 def described(given: Input) -> str:
     """Return how many numbers an input has, and of which sources, for messages."""
     sizes = ", ".join(f"{take.name} {take.size}" for take in given.takes)
-    return f"{prod(given.shape)} numbers ({shortened(sizes, 300)})"
+    several = "" if given.past is None else f", of the last {given.past.length} inferences"
+    return f"{prod(given.shape)} numbers ({shortened(sizes, 300)}{several})"
 
 
 class _Reader:
@@ -81,14 +138,16 @@ class _Reader:
     Args:
         space: of the observations.
         own: as of ``fitted_inputs``.
+        entry: the step at which the policy starts.
     """
 
-    def __init__(self, space: Space[Any], own: Mapping[str, tuple[int, ...]]) -> None:
+    def __init__(self, space: Space[Any], own: Mapping[str, tuple[int, ...]], entry: int) -> None:
         from skillweave.spaces.packing import obs_dtype
 
         obs_dtype(space)  # raises where the space is not supported
         self.space = space
         self.own = own
+        self.entry = entry
         self.leaves = space_of(space).leaves
 
     def takes(self, source: Source, alone: bool, where: str) -> list[Take]:
@@ -111,16 +170,28 @@ class _Reader:
             return [Take("goal", self.own["goal"], low=low, high=high)]
         if isinstance(source, LastAction):
             return [Take("last_action", self.own["last_action"])]
+        if isinstance(source, Elapsed):
+            clock = Clock(np.atleast_1d(source.first), source.period, source.wave or "")
+            return [Take("time", (clock.size,), time=clock)]
+        if isinstance(source, Table):
+            numbers = source.file.numbers
+            if source.columns is not None:
+                size = numbers.shape[1]
+                numbers = numbers[:, places_in(source.columns, size, f"{where}.columns")]
+            rows = Rows(numbers, source.rate, source.start)
+            return [Take("time", (rows.size,), time=rows)]
         who = f"{where}, a function,"
         function = of_numbers(source.function, who)
+        obs = made_up(self.space, 2)
+        call = InCall(np.full(2, self.entry), obs, self.entry) if source.takes_call else None
         with examples(source.function):
-            shape = numbers_of(function, made_up(self.space, 2), who).shape[1:]
+            shape = numbers_of(function, obs, who, call=call).shape[1:]
         if len(shape) > 1 and not alone:
             raise PolicyError(
                 f"{where}: a function beside other parts must return (n, numbers), not shape "
                 f"{(2, *shape)}"
             )
-        return [Take("function", shape, function=function, who=who)]
+        return [Take("function", shape, function=function, takes_call=source.takes_call, who=who)]
 
     def _reads(self, part: Part, alone: bool, where: str) -> list[Take]:
         """Return a ``Take`` of each leaf that a part reads, in the part's order."""
@@ -250,9 +321,12 @@ def for_model(inputs: dict[str, Input], expected: Shapes, who: str) -> dict[str,
         if wanted in ((), (1,)) and has in ((), (1,)):
             found[name] = replace(given, shape=(1,) * len(wanted), reshaped=True)
             continue
-        text = f"{who}: {_field(name)} gives {described(given)}"
         known = [n for n in wanted if n is not None]
         numbers, size = prod(known), prod(has)
+        if given.past is not None and len(known) == len(wanted) and numbers == size:
+            found[name] = replace(given, shape=tuple(known), reshaped=True)  # (inferences, numbers)
+            continue
+        text = f"{who}: {_field(name)} gives {described(given)}"
         if len(known) < len(wanted) or numbers == size:
             shape = "(" + ", ".join("n" if x is None else str(x) for x in wanted) + ")"
             raise PolicyError(

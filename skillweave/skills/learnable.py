@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from skillweave.policies.core import Array
 from skillweave.policies.untrusted import checksum
 from skillweave.schema import fitted
 from skillweave.skills.goal_spaces import goal_part, other_goals
-from skillweave.skills.mapping import LastAction, PolicyMapping
+from skillweave.skills.mapping import Elapsed, LastAction, PolicyMapping, Table
 
 if TYPE_CHECKING:
     from torch import nn
@@ -45,11 +46,34 @@ def no_mapping(who: str, given: str) -> str:
     )
 
 
+def _sees(kind: type[Any], mapping: PolicyMapping) -> bool:
+    """Return whether an input of a mapping has a source of a kind."""
+    return any(isinstance(source, kind) for source in mapping.sources())
+
+
 REFUSED: tuple[tuple[str, Callable[[PolicyMapping], bool], str], ...] = (
     (
         "sees has LastAction()",
-        lambda x: any(isinstance(source, LastAction) for source in x.sources()),
+        partial(_sees, LastAction),
         "let the environment observe its last action, and read it, Part('last_action')",
+    ),
+    *(
+        (
+            f"sees has {kind.__name__}",
+            partial(_sees, kind),
+            "let the environment observe the time, and read it, Part('time')",
+        )
+        for kind in (Elapsed, Table)
+    ),
+    (
+        "sees has history",
+        lambda x: any(getattr(source, "history", 1) > 1 for source in x.sources()),
+        "let the environment observe its past, by a wrapper, and read it as a Part",
+    ),
+    (
+        "sees has a function with call, or entry is given",
+        lambda x: x.timed,
+        "let the environment observe the time since the skill took over, and read it as a Part",
     ),
     ("every is given", lambda x: x.every > 1, "let the environment repeat an action"),
     ("chunk is given", lambda x: x.chunk is not None, "let it learn a correction, Residual(...)"),

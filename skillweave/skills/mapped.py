@@ -23,7 +23,7 @@ from skillweave.policies.core import Array, RowPolicy, Turn, World
 from skillweave.policies.functional import Functional
 from skillweave.policies.mapped import Function, Input, Mapped, Model, numbers_of
 from skillweave.policies.parts import GOAL, OBSERVATION
-from skillweave.policies.spaces import Space as Data
+from skillweave.policies.spaces import Space as Data, space_of
 from skillweave.skills.fit_mapping import described, fitted_inputs, fitted_outputs, for_model
 from skillweave.skills.foreign_policy import EXAMPLES, SEES, Foreign, made_up
 from skillweave.skills.function_state import FunctionState, examples
@@ -109,8 +109,10 @@ class MappedPolicy(Functional, Foreign, Model):
                 own["goal"] = goal.shape
             inputs = for_model(fitted_inputs(mapping, seen, who, own), model.expected, who)
         ramp = 0 if mapping.acts is None else mapping.acts.ramp
-        how = mapping.every, mapping.chunk, goal, goal_space, ramp, mapping.anew
-        return Mapped(model, outputs, inputs, *how, who, notice)
+        takes = [take for given in (inputs or {}).values() for take in given.takes]
+        entered = space_of(seen) if any(take.takes_call for take in takes) else None
+        how = mapping.every, mapping.chunk, goal, goal_space, ramp, mapping.anew, mapping.entry
+        return Mapped(model, outputs, inputs, *how, entered, who, notice)
 
     def try_out(self) -> None:
         """Act once on two example observations, and look at a model's outputs.
@@ -241,7 +243,8 @@ class MappedPolicy(Functional, Foreign, Model):
         """
         policy = copy.copy(self)
         try:
-            policy.mapping = PolicyMapping.from_json(data or {}, self.mapping.functions())
+            mine = self.mapping
+            policy.mapping = PolicyMapping.from_json(data or {}, mine.functions(), mine.tables())
         except DeclarationError as error:
             raise RunError(
                 f"{where}: its policy had another mapping, which cannot be restored: {error}"
@@ -309,11 +312,12 @@ def look_at_outputs(policy: MappedPolicy) -> None:
 
 def hidden_state(written: Sequence[str]) -> str:
     """Return a clause about the tensors that a module writes, and by which it answers."""
+    named = f"; or, if these are its buffers, name them: state={tuple(written)}" if written else ""
     return (
         f"keeps a hidden state, {', '.join(map(repr, written[:3])) or 'an attribute'}, which would "
         "run on from one episode into the next, and which all environments would share: let "
         "forward(obs, state) return the output and the next state, and give the shape of the "
-        "state, from_torch(module, state=(None, 64))"
+        "state, from_torch(module, state=(None, 64))" + named
     )
 
 

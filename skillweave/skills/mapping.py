@@ -17,7 +17,10 @@ from skillweave._internal.messages import short
 from skillweave._internal.named import named
 from skillweave.errors import DeclarationError
 from skillweave.policies.mapped import LONGEST
-from skillweave.schema import Check, Count, fitted, settings
+from skillweave.policies.timed import LONGEST as LONGEST_PAST
+from skillweave.schema import Check, Count, Positive, fitted, settings
+from skillweave.skills.outputs import parameters_of
+from skillweave.skills.tables import Recording, recorded, recording
 
 # Values of fields
 
@@ -62,7 +65,7 @@ Numbers = Annotated[Any, Check("a finite number, or a list of such", convert=flo
 """A number, or one for each of several."""
 Range = Annotated[Any, Check("the lowest and the highest number: (-1.0, 1.0)", convert=_range)]
 """The lowest and the highest number."""
-Anew = Literal["state", "last_action", "held"]
+Anew = Literal["state", "last_action", "held", "elapsed", "history"]
 """What a policy remembers, and may begin anew in each call."""
 Places = Annotated[Any, Check("a slice, or a list of places, counted from 0", convert=_places)]
 """A slice or a tuple of places."""
@@ -78,6 +81,9 @@ GoalValue = (
 )
 """The goal of a policy."""
 _Steps = Annotated[int, Check(f"at least 1 and at most {LONGEST:,}", lambda x: 1 <= x <= LONGEST)]
+_Past = Annotated[
+    int, Check(f"at least 1 and at most {LONGEST_PAST:,}", lambda x: 1 <= x <= LONGEST_PAST)
+]
 
 
 # Parts of an input
@@ -98,7 +104,23 @@ class Scaling:
 
 
 @settings
-class Part(Scaling):
+class WithPast(Scaling):
+    """A scaling of inputs that may hold the numbers of a few inferences."""
+
+    _: KW_ONLY
+    history: _Past = 1
+    """The policy takes the numbers of this many inferences, this one included."""
+    fill: Literal["first", "zeros"] = "first"
+    """What stands there before the first inference: its numbers, or zeros, which are not scaled."""
+    layout: Literal["term", "step"] = "term"
+    """"term": all inferences of this part, then the next part. "step": neighbouring parts that say
+    so are joined, all parts of one inference, then those of the next."""
+    order: Literal["oldest", "newest"] = "oldest"
+    """The inference that stands first."""
+
+
+@settings
+class Part(WithPast):
     """Numbers of the observation as inputs of a policy: ``(number - offset) * scale``, clipped.
 
     ```python
@@ -135,7 +157,7 @@ class Part(Scaling):
 
 
 @settings
-class Goal(Scaling):
+class Goal(WithPast):
     """The place of the goal, a command for example, among the inputs of a policy.
 
     Its value is the ``goal=`` of the policy.
@@ -155,7 +177,7 @@ class Goal(Scaling):
 
 
 @settings
-class LastAction(Scaling):
+class LastAction(WithPast):
     """The place of the policy's last output among its inputs; zeros before the first.
 
     It is the output of the policy itself, after ``Acts.clip`` and before ``Acts.scale``.
@@ -166,18 +188,90 @@ class LastAction(Scaling):
 
 
 @settings
+class Elapsed(Scaling):
+    """A clock among the inputs of a policy: the steps since its skill took over.
+
+    ```python
+    import skillweave as sw
+
+    step = sw.Elapsed(clip=(0, 299))
+    phase = sw.Elapsed(period=40, wave="sin"), sw.Elapsed(period=40, wave="cos")
+    feet = sw.Elapsed(period=50, first=(0, 25), wave="cos")
+    ```
+
+    It starts again after another skill's call, and goes on where the skill is called again at once,
+    unless ``anew`` of its policy names "elapsed".
+
+    Raises:
+        DeclarationError: a setting is wrong; the message names it.
+    """
+
+    _: KW_ONLY
+    period: Positive | None = None
+    """The steps after which it starts again at 0; None: it counts on."""
+    first: Numbers = 0.0
+    """Its number at the first step; or several, of as many clocks."""
+    wave: Literal["sin", "cos"] | None = None
+    """The sine or cosine of 2π · number / period; None: the number itself, in steps."""
+
+    def __post_init__(self) -> None:
+        if self.wave is not None and self.period is None:
+            raise DeclarationError(f"Elapsed.wave is {self.wave!r}: give period, too, in steps")
+
+
+@settings
+class Table(Scaling):
+    """Rows of a table among the inputs of a policy: a reference motion, a row for each step.
+
+    ```python
+    import numpy as np
+    import skillweave as sw
+
+    motion = sw.Table(np.zeros((300, 7)), columns=slice(3, 7), rate=0.6, start=12)
+    ```
+
+    It starts after another skill's call, as ``Elapsed`` does. Its last row stays. Between two rows
+    numbers are on the line between them, so quaternions should have one row for each step.
+
+    Raises:
+        DeclarationError: a setting is wrong; the message names it.
+        RunError: the file cannot be read.
+    """
+
+    file: Any
+    """A .csv file, perhaps with a line of names, or a .npy file, or an array: (rows, columns)."""
+    columns: Places | None = None
+    """Its columns, counted from 0, in the order in which the policy takes them; None: all."""
+    _: KW_ONLY
+    rate: Positive = 1.0
+    """Rows for each step: 0.6 for 30 rows and 50 steps a second."""
+    start: Annotated[float, Check("finite")] = 0.0
+    """The row of the first step."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "file", recording(self.file))
+
+
+@settings
 class Computed(Scaling):
     """Numbers (n, K) that a function of the user makes of observations (n, *obs_shape)."""
 
     function: Callable[[Any], Any] | None = None
     """The function."""
 
+    @property
+    def takes_call(self) -> bool:
+        """It has a parameter ``call``, for the time of the call."""
+        return any(p.name == "call" for p in parameters_of(self.function))
 
-Source = Part | Goal | LastAction | Computed
+
+Source = Part | Goal | LastAction | Elapsed | Table | Computed
 KINDS: dict[str, type[Any]] = {
     "observation": Part,
     "goal": Goal,
     "last_action": LastAction,
+    "elapsed": Elapsed,
+    "table": Table,
     "function": Computed,
 }
 """Kinds of sources, by their names in files."""
@@ -254,18 +348,29 @@ class PolicyMapping:
     chunk: int | None = None
     """The number of actions that are used of each inference; None: an inference is one action."""
     state: tuple[Any, ...] = ()
-    """The recurrent state: pairs (input, output) of an ONNX file, or shapes with None as the axis
-    of the environments."""
+    """The recurrent state: of an ONNX file (input, output), perhaps with a first value; shapes with
+    None as the axis of the environments; or names of a module's buffers."""
     single_state: bool = False
     """A module takes and returns one array as its state, not a tuple."""
     scaling: dict[str, Scaling] = field(default_factory=dict)
     """A last scaling of whole inputs: the statistics of ``VecNormalize``."""
     anew: tuple[str, ...] = ()
     """What begins anew in each call, also where the skill is called again at once."""
+    entry: int = 0
+    """The step at which its time starts, where the skill takes over."""
 
     def sources(self) -> list[Source]:
         """Return the parts of all inputs."""
         return [source for parts in (self.sees or {}).values() for source in parts]
+
+    @property
+    def timed(self) -> bool:
+        """Return whether an input depends on the steps since the skill took over."""
+        return any(
+            isinstance(source, Elapsed | Table)
+            or (isinstance(source, Computed) and source.takes_call)
+            for source in self.sources()
+        )
 
     @property
     def goal_places(self) -> list[Goal]:
@@ -278,6 +383,7 @@ class PolicyMapping:
             "every": _Steps,
             "chunk": _Steps | None,
             "anew": tuple[Anew, ...],
+            "entry": int,
         }
         for name, kind in kinds.items():
             object.__setattr__(self, name, fitted(kind, getattr(self, name), name))
@@ -285,12 +391,22 @@ class PolicyMapping:
             "state": bool(self.state),
             "last_action": any(isinstance(source, LastAction) for source in self.sources()),
             "held": self.every > 1 or self.chunk is not None,
+            "elapsed": self.timed,
+            "history": any(getattr(source, "history", 1) > 1 for source in self.sources()),
         }
         if idle := [name for name in self.anew if not kept[name]]:
             raise DeclarationError(
                 f"anew names {idle[0]!r}, but the policy remembers none: it has no "
-                "state=, no LastAction() in sees, or no every= and chunk="
+                "state=, no LastAction() in sees, no every= and chunk=, no Elapsed(), Table() or "
+                "function with call in sees, or no history="
             )
+        if self.entry and not self.timed:
+            raise DeclarationError(
+                f"entry is {self.entry}, but nothing in sees depends on time: no Elapsed(), no "
+                "Table(), and no function with call"
+            )
+        for name, parts in (self.sees or {}).items():
+            _check_layout(parts, f"sees[{name!r}]" if name else "sees")
         if self.goal is not None and not self.goal_places:
             raise DeclarationError(
                 "goal is given, but the policy does not take it: write Goal() at its place in sees"
@@ -309,6 +425,11 @@ class PolicyMapping:
             named[next(x for x in names if named.get(x, function) is function)] = function
         return named
 
+    def tables(self) -> dict[str, Recording]:
+        """Return its tables by their checksums, as ``to_json`` names them."""
+        found = [source.file for source in self.sources() if isinstance(source, Table)]
+        return {table.sha256: table for table in found}
+
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON; settings that have their defaults are left out."""
         names = {id(function): name for name, function in self.functions().items()}
@@ -317,26 +438,30 @@ class PolicyMapping:
 
     @classmethod
     def from_json(
-        cls, data: Any, code: Mapping[str, Callable[..., Any]] | None = None
+        cls,
+        data: Any,
+        code: Mapping[str, Callable[..., Any]] | None = None,
+        tables: Mapping[str, Recording] | None = None,
     ) -> PolicyMapping:
         """Return the mapping that ``to_json`` wrote.
 
         Args:
             data: its JSON.
             code: the user's functions, by name.
+            tables: its tables, by their checksums.
 
         Raises:
             DeclarationError: a field has a wrong value; the message names it.
         """
-        code = code or {}
+        beside = {**(tables or {}), **(code or {})}
         fitted(Mapping[str, Any], data, "the mapping")
         sees = fitted(dict[str, tuple[Any, ...]] | None, data.get("sees"), "sees")
         for name, parts in (sees or {}).items():
             where = f"sees[{name!r}]"
-            sees[name] = tuple(_source(x, code, f"{where}[{i}]") for i, x in enumerate(parts))
+            sees[name] = tuple(_source(x, beside, f"{where}[{i}]") for i, x in enumerate(parts))
         goal = data.get("goal")
         if isinstance(goal, Mapping):
-            goal = _function(goal.get("function"), code, "goal")
+            goal = _function(goal.get("function"), beside, "goal")
         acts = fitted(Acts | None, data.get("acts"), "acts")
         scaling = fitted(dict[str, Scaling], data.get("scaling", {}), "scaling")
         state = fitted(tuple[tuple[Any, ...], ...], data.get("state", ()), "state")
@@ -344,7 +469,8 @@ class PolicyMapping:
         every = data.get("every", 1)
         chunk = data.get("chunk")
         anew = tuple(data.get("anew", ()))
-        return cls(sees, goal, acts, every, chunk, state, single, scaling, anew)
+        entry = data.get("entry", 0)
+        return cls(sees, goal, acts, every, chunk, state, single, scaling, anew, entry)
 
 
 def mapping_of(
@@ -357,6 +483,7 @@ def mapping_of(
     state: Any = None,
     scaling: Mapping[str, Scaling] | None = None,
     anew: Any = (),
+    entry: Any = 0,
 ) -> PolicyMapping:
     """Return the mapping that a user declares by arguments of ``from_onnx`` and its like.
 
@@ -372,7 +499,8 @@ def mapping_of(
         meaning = _checked_acts(acts)
         scalings = dict(scaling or {})
         anew = (anew,) if isinstance(anew, str) else anew
-        return PolicyMapping(parts, goal, meaning, every, chunk, states, single, scalings, anew)
+        how = every, chunk, states, single, scalings, anew, entry
+        return PolicyMapping(parts, goal, meaning, *how)
     except DeclarationError as error:
         raise DeclarationError(f"{who}: {error}") from None
 
@@ -399,26 +527,37 @@ def as_source(value: Any, where: str, of_skill: bool = False) -> Source:
     kind = value if isinstance(value, type) else type(value)
     if of_skill and (why := _NOT_OF_SKILLS.get(kind)):
         raise DeclarationError(f"{where} has {kind.__name__}(), {why}: leave it out")
+    if of_skill and getattr(value, "history", 1) > 1:
+        raise DeclarationError(f"{where} has history, {_NO_TIME}: leave it out")
     if isinstance(value, Source):
         return value
-    if isinstance(value, type) and value in (Goal, LastAction, Part):
+    if isinstance(value, type) and value in (Goal, LastAction, Part, Elapsed):
         raise DeclarationError(f"{where} is the class {value.__name__}; write {value.__name__}()")
     if isinstance(value, str):
         return Part(value)
     if is_places(value):
         return Part(places=value)
     if callable(value):
-        return Computed(function=value)
-    others = "" if of_skill else "Goal(), LastAction(), "
+        computed = Computed(function=value)
+        if of_skill and computed.takes_call:
+            raise DeclarationError(f"{where} takes call, {_NO_TIME}: leave it out")
+        return computed
+    others = "" if of_skill else "Goal(), LastAction(), Elapsed(), Table(...), "
     raise DeclarationError(
         f"{where} is {short(value)}; it must be the key of a part of the observation, a place in "
         f"it, a slice, Part(...), {others}or a function of observations"
     )
 
 
+_NO_TIME = (
+    "which only a policy from elsewhere has, in its own sees; a skill that learns sees "
+    "observations alone, so let the environment observe it"
+)
 _NOT_OF_SKILLS: dict[type[Any], str] = {
     Goal: "but the policy of a skill with a goal_space sees the goal of its call already",
     LastAction: "which only a policy from elsewhere takes, in its own sees",
+    Elapsed: _NO_TIME,
+    Table: _NO_TIME,
 }
 """Sources that a skill's ``sees`` cannot have, and why."""
 
@@ -477,6 +616,20 @@ def _checked_parts(parts: Any, where: str, of_skill: bool) -> tuple[Source, ...]
     return tuple(as_source(part, f"{where}[{i}]", of_skill) for i, part in enumerate(parts))
 
 
+def _check_layout(parts: Sequence[Source], where: str) -> None:
+    """Raise a DeclarationError where parts with layout "step" are not joined into one block."""
+    joined = [i for i, part in enumerate(parts) if getattr(part, "layout", "term") == "step"]
+    if not joined:
+        return
+    several: list[Any] = [parts[i] for i in joined]
+    alike = {(part.history, part.order) for part in several}
+    if joined != list(range(joined[0], joined[-1] + 1)) or len(alike) > 1:
+        raise DeclarationError(
+            f'{where}: parts with layout="step" are joined, all parts of one inference, then those '
+            "of the next: let them be neighbours, with the same history and the same order"
+        )
+
+
 def _checked_acts(acts: Any) -> Acts | None:
     """Return ``acts`` of a mapping as ``Acts``; None: not given."""
     if acts is None or isinstance(acts, Acts):
@@ -493,8 +646,11 @@ def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
     if state is None:
         return (), False
     if isinstance(state, Mapping) and state:
-        if all(isinstance(x, str) for pair in state.items() for x in pair):
-            return tuple(state.items()), False
+        pairs = tuple(_checked_pair(name, after) for name, after in state.items())
+        if all(pair is not None for pair in pairs):
+            return pairs, False
+    elif are_names(state):
+        return (state,) if isinstance(state, str) else tuple(state), False
     elif isinstance(state, list | tuple) and state:
         single = not isinstance(state[0], list | tuple)
         shapes = (tuple(state),) if single else tuple(tuple(shape) for shape in state)
@@ -505,7 +661,33 @@ def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
     raise DeclarationError(
         f"state is {short(state)}; it must be a shape with None as the axis of the environments, "
         "(None, 64), or a list of such shapes; of an ONNX file the name of the output that is the "
-        "next state by the name of each input: {'h_in': 'h_out'}"
+        "next state by the name of each input, {'h_in': 'h_out'}, perhaps with the value that it "
+        "starts with, {'t': ('t_next', 1.0)}; of TorchScript the names of its buffers"
+    )
+
+
+def _checked_pair(name: Any, after: Any) -> tuple[Any, ...] | None:
+    """Return an ONNX file's input of a state, its output, and perhaps its first value, or None."""
+    if isinstance(name, str) and isinstance(after, str):
+        return name, after
+    if isinstance(name, str) and isinstance(after, list | tuple) and len(after) == 2:
+        output, first = after
+        try:
+            numbers = floats(np.asarray(first, np.float64).reshape(-1))
+        except (TypeError, ValueError):
+            return None
+        if isinstance(output, str) and isinstance(numbers, tuple):
+            return name, output, numbers if np.ndim(first) else numbers[0]
+    return None
+
+
+def are_names(state: Any) -> bool:
+    """Return whether a declared state is names of a module's buffers."""
+    several = (state,) if isinstance(state, str) else state
+    return (
+        isinstance(several, list | tuple)
+        and bool(several)
+        and all(isinstance(name, str) and name for name in several)
     )
 
 
@@ -526,13 +708,15 @@ def to_json(value: Any, names: Mapping[int, str] | None = None) -> Any:
         return [to_json(x, names) for x in value]
     if isinstance(value, Mapping):
         return {k: to_json(x, names) for k, x in value.items()}
+    if isinstance(value, Recording):
+        return value.to_json()
     if not is_dataclass(value):
         return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
     kinds = [("source", name) for name, kind in KINDS.items() if isinstance(value, kind)]
     content: dict[str, Any] = dict(kinds)
     for entry in fields(value):
         setting = getattr(value, entry.name)
-        if setting in (entry.default, {}):
+        if not isinstance(setting, Recording) and setting in (entry.default, {}):
             continue
         if callable(setting):
             name = (names or {})[id(setting)]
@@ -546,7 +730,7 @@ def _source(data: Any, code: Mapping[str, Any], where: str) -> Source:
     """Return a source, of the one of ``KINDS`` that its field ``source`` names.
 
     Args:
-        code: the user's functions, by name.
+        code: the user's functions by name, and tables by checksum.
     """
     name = data.get("source") if isinstance(data, Mapping) else None
     kind = KINDS.get(name) if isinstance(name, str) else None
@@ -557,6 +741,8 @@ def _source(data: Any, code: Mapping[str, Any], where: str) -> Source:
     given = {k: x for k, x in data.items() if k != "source"}
     if kind is Computed:
         given["function"] = _function(given.get("function"), code, where)
+    if kind is Table:
+        given["file"] = recorded(given.get("file"), code, where)
     source: Source = fitted(kind, given, where)
     return source
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -56,7 +57,7 @@ class OnnxPolicy(MappedPolicy):
         super().__init__(str(file), observation_space, action_space, mapping)
         self.data = data
         inputs = self._session.get_inputs()
-        states = dict(self.mapping.state)
+        states = {name for name, *_ in self.mapping.state}
         free = [i for i in inputs if i.name not in states]
         several = self.mapping.sees is not None and "" not in self.mapping.sees
         if not free or (len(free) > 1 and not several):
@@ -78,8 +79,11 @@ class OnnxPolicy(MappedPolicy):
     @property
     def model(self) -> OnnxFile:
         """The acting model of the file."""
-        how = self.mapping.state, self._who, self._session
-        return OnnxFile(self.data, self.output, tuple(self.free), *how)
+        declared = self.mapping.state
+        state = tuple((name, after) for name, after, *_ in declared)
+        first = tuple((name, np.array(value[0])) for name, _, *value in declared if value)
+        how = tuple(self.free), state, first, self._who, self._session
+        return OnnxFile(self.data, self.output, *how)
 
     @cached_property
     def _session(self) -> Any:
@@ -119,7 +123,7 @@ class OnnxPolicy(MappedPolicy):
         space = space_of(self.action_space)
         size = space.size
         choices = sum(space.counts)
-        after = dict(self.mapping.state).values()
+        after = [after for _, after, *_ in self.mapping.state]
         ranks: dict[tuple[bool, ...], list[str]] = {}
         for output in self._session.get_outputs():
             numbers = math.prod(n for n in output.shape[1:] if isinstance(n, int))
@@ -208,6 +212,7 @@ def from_onnx(
     chunk: int | None = None,
     state: Any = None,
     anew: Any = (),
+    entry: int = 0,
     observation_space: Any = None,
     action_space: Any = None,
     learn: Literal[False] = False,
@@ -226,6 +231,7 @@ def from_onnx(
     chunk: int | None = None,
     state: Any = None,
     anew: Any = (),
+    entry: int = 0,
     observation_space: Any = None,
     action_space: Any = None,
     learn: Literal[True],
@@ -244,6 +250,7 @@ def from_onnx(
     chunk: int | None = None,
     state: Any = None,
     anew: Any = (),
+    entry: int = 0,
     observation_space: Any = None,
     action_space: Any = None,
     learn: bool = False,
@@ -255,8 +262,11 @@ def from_onnx(
 
     ``sees`` lists the numbers of the policy's input in their order: keys of a Dict observation,
     places and slices of its flat form, ``Part(...)`` with scale and offset, ``Goal()``,
-    ``LastAction()``, and functions of observations that return (n, numbers). Of several inputs it
-    has a list each, by name: ``{"obs": ("gyro", "joints"), "command": Goal()}``.
+    ``LastAction()``, the clock ``Elapsed()``, a ``Table(...)``, and functions of observations that
+    return (n, numbers). ``Part``, ``Goal`` and ``LastAction`` may have a ``history``. A function
+    with a parameter ``call`` also gets the time since the skill took over: ``call.steps`` (n,),
+    and ``call.start``, the observations of that step. Of several inputs it has a list each, by
+    name: ``{"obs": ("gyro", "joints"), "command": Goal()}``.
 
     With ``learn=True`` the skill is trained by ``PPO``, and begins with the network in the file:
     linear layers with one kind of nonlinearity between them, perhaps with a normalisation of the
@@ -264,8 +274,9 @@ def from_onnx(
     the critic and the deviation of actions (``PPO(action_std_init=...)``, in the unit of the file's
     outputs) start afresh. ``acts`` is applied to sampled outputs. A fixed ``goal`` stays, and the
     weights of its inputs with it. ``Run.save_onnx`` writes the result as the same file with other
-    weights. Such a policy has no time or memory of its own: ``LastAction()``, ``every``,
-    ``chunk``, ``state``, ``anew``, and ``ramp``, ``to`` and ``rest`` of ``Acts`` are refused.
+    weights. Such a policy has no time or memory of its own: in ``sees`` neither ``LastAction()``
+    nor ``Elapsed()``, ``Table(...)``, ``history`` or ``call``; ``every``, ``chunk``, ``state``,
+    ``anew``, ``entry``, and ``ramp``, ``to`` and ``rest`` of ``Acts`` are refused, too.
 
     Args:
         path: the file; weights in a second file beside it are read, too.
@@ -279,10 +290,13 @@ def from_onnx(
         chunk: the number of actions that are used of each inference, where the output is
             (n, H, ...): a sequence of H actions. None: an inference gives one action.
         state: the recurrent state: the name of the output that is the next state, by the name of
-            each input: ``{"h_in": "h_out"}``. It starts with zeros.
+            each input: ``{"h_in": "h_out"}``. It starts with zeros, or with a value that is given
+            beside the name: ``{"time_step": ("next_step", 1.0)}``.
         anew: what begins anew where the skill is called again at once: "state", "last_action",
-            "held" (of ``every`` and ``chunk``), or several. The rest goes on, clocks too; after
-            another skill's call all begins anew.
+            "held" (of ``every`` and ``chunk``), "elapsed" (clocks, tables and ``call``), "history",
+            or several. The rest goes on; after another skill's call all begins anew.
+        entry: the step at which time starts where the skill takes over, of ``Elapsed``, ``Table``
+            and ``call`` in ``sees``: a motion is entered in its middle.
         observation_space: None: the environment's.
         action_space: None: the environment's.
         learn: the skill learns on from the file.
@@ -297,8 +311,10 @@ def from_onnx(
         DeclarationError: an argument is wrong; the message names it.
         MissingExtra: the extra 'onnx' is not installed.
     """
-    mapping = mapping_of("from_onnx()", sees, goal, acts, every, chunk, state, anew=anew)
-    if mapping.state and not isinstance(state, dict):
+    mapping = mapping_of(
+        "from_onnx()", sees, goal, acts, every, chunk, state, anew=anew, entry=entry
+    )
+    if mapping.state and not isinstance(state, Mapping):
         raise DeclarationError(
             "from_onnx(): state gives shapes; name the inputs and outputs of the file: "
             "state={'h_in': 'h_out'}"

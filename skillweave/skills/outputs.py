@@ -14,7 +14,7 @@ from skillweave._internal.messages import error_text, short, suggest
 from skillweave._internal.rewards import LARGEST_REWARD, wrong_reward
 from skillweave._internal.tracebacks import is_users
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
-from skillweave.policies.core import Array, Step, read_only
+from skillweave.policies.core import Array, InCall, Step, read_only
 from skillweave.policies.floats import by_program
 from skillweave.policies.infos import NUMBERS, Infos
 from skillweave.skills.probing import look_at
@@ -94,9 +94,12 @@ def of_numbers(function: Any, who: str) -> Wrapped:
     return Wrapped(function, partial(_numbers, function, who))
 
 
-def _numbers(function: Any, who: str, obs: Array) -> Array:
+def _numbers(function: Any, who: str, obs: Array, call: InCall | None = None) -> Array:
     convert = partial(as_array, who=who, kind=PolicyError)
-    return cast(Array, call_user(function, obs, who, kind=PolicyError, convert=convert))
+    named = {} if call is None else {"call": call}
+    return cast(
+        Array, call_user(function, obs, who, kind=PolicyError, named=named, convert=convert)
+    )
 
 
 def call_checked(

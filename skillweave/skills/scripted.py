@@ -16,7 +16,7 @@ from skillweave.policies.mapped import Function
 from skillweave.policies.parts import GOAL
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.mapped import MappedPolicy
-from skillweave.skills.mapping import PolicyMapping, mapping_of
+from skillweave.skills.mapping import PolicyMapping, are_names, mapping_of
 from skillweave.skills.outputs import (
     Wrapped,
     as_array,
@@ -142,6 +142,7 @@ def from_function(
     chunk: int | None = None,
     state: Any = None,
     anew: Any = (),
+    entry: int = 0,
     observation_space: Any = None,
     action_space: Any = None,
 ) -> ScriptedPolicy:
@@ -168,8 +169,10 @@ def from_function(
         state: the shape of a recurrent state, None as the axis of the environments: (None, 8); or a
             list of shapes. It starts with zeros.
         anew: what begins anew where the skill is called again at once: "state", "last_action",
-            "held" (of ``every`` and ``chunk``), or several. The rest goes on, clocks too; after
-            another skill's call all begins anew.
+            "held" (of ``every`` and ``chunk``), "elapsed" (clocks, tables and ``call``), "history",
+            or several. The rest goes on; after another skill's call all begins anew.
+        entry: the step at which time starts where the skill takes over, of ``Elapsed``, ``Table``
+            and ``call`` in ``sees``: a motion is entered in its middle.
         observation_space: None: the environment's.
         action_space: None: the environment's.
 
@@ -183,5 +186,12 @@ def from_function(
         raise DeclarationError(
             f"from_function takes a function of observations, not {short(function)}"
         )
-    mapping = mapping_of("from_function()", sees, goal, acts, every, chunk, state, anew=anew)
+    if are_names(state):
+        raise DeclarationError(
+            f"from_function(): state is {short(state)}, names of a module's buffers: give the "
+            "shape of the state, (None, 8)"
+        )
+    mapping = mapping_of(
+        "from_function()", sees, goal, acts, every, chunk, state, anew=anew, entry=entry
+    )
     return ScriptedPolicy(function, observation_space, action_space, mapping)

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave._internal.arguments import checked_names
-from skillweave._internal.messages import short, shortened
+from skillweave._internal.messages import short, shortened, suggest
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.policies.core import Array, Turn
 from skillweave.policies.mapped import invoke, of_model, parted, rows_first, states_of
@@ -24,7 +24,7 @@ from skillweave.schema import fitted
 from skillweave.skills.foreign_policy import made_up, qualified
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, layers_of, no_mapping
 from skillweave.skills.mapped import MappedPolicy, hidden_state
-from skillweave.skills.mapping import PolicyMapping, mapping_of
+from skillweave.skills.mapping import PolicyMapping, are_names, mapping_of
 
 if TYPE_CHECKING:
     from torch import nn
@@ -58,6 +58,15 @@ class TorchPolicy(MappedPolicy):
         """Its name in runs."""
         self.origin = {"file": name, "sha256": checksum(content)} if file else {}
         """The file's path and checksum; {}: it was made in memory."""
+        declared = self.mapping.state
+        self.buffers: tuple[str, ...] = declared if are_names(declared) else ()
+        """The names of the buffers in which its recurrent state lies; (): forward takes it."""
+        known = dict(module.named_buffers())
+        if missing := [name for name in self.buffers if name not in known]:
+            raise PolicyError(
+                f"{name} has no buffer {missing[0]!r} (state)"
+                f"{suggest(missing[0], known)}: it has {', '.join(known)[:300] or 'none'}"
+            )
 
     def __getstate__(self) -> dict[str, Any]:
         state = dict(vars(self))
@@ -99,7 +108,12 @@ class TorchPolicy(MappedPolicy):
                 several = value if isinstance(value, tuple | list) else (value,)
                 inner = {f"{path}.{name}".lstrip("."): x for x in several if isinstance(x, Tensor)}
                 found |= inner
-        return {name: x.detach().cpu().numpy().copy() for name, x in found.items()}
+        declared = set(self.buffers)
+        return {
+            name: x.detach().cpu().numpy().copy()
+            for name, x in found.items()
+            if name not in declared
+        }
 
     def _failure(self, error: BaseException) -> PolicyError:
         """Return the error of a call that failed, or that a state of one environment is kept."""
@@ -117,6 +131,9 @@ class TorchPolicy(MappedPolicy):
     @property
     def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:
         """The declared shapes of its state, in float64, which holds any module's."""
+        if self.buffers:
+            known = dict(self.module.named_buffers())
+            return [(tuple(known[name].shape), np.float64) for name in self.buffers]
         return states_of(self.mapping.state)
 
     def call(
@@ -135,6 +152,8 @@ class TorchPolicy(MappedPolicy):
         device = weights[0].device if weights else None
         dtype = next((x.dtype for x in weights if x.is_floating_point()), torch.float32)
         given = {name: _tensors(x, device, dtype) for name, x in given.items()}
+        if self.buffers:
+            return self._call_rows(given, state)
         before = [_tensors(x, device, dtype) for x in of_model(state, mapping.state)]
         try:
             with torch.inference_mode():
@@ -150,6 +169,38 @@ class TorchPolicy(MappedPolicy):
         output = output.float() if output.is_floating_point() else output
         arrays = [x.to(torch.float64).cpu().numpy() for x in after]
         return output.cpu().numpy(), rows_first(arrays, mapping.state, self._who)
+
+    def _call_rows(
+        self, given: dict[str, Any], state: tuple[Array, ...]
+    ) -> tuple[Array, Sequence[Array]]:
+        """Call the module for one environment after the other, with its state in its buffers."""
+        import torch
+        from torch.utils import _pytree as pytree
+
+        known = dict(self.module.named_buffers())
+        own = [known[name] for name in self.buffers]
+        outputs, after = list[Array](), list[list[Array]]()
+        # No inference_mode: its tensors cannot be written to afterwards.
+        with torch.no_grad():
+            for i in range(len(state[0])):
+                for buffer, value in zip(own, state, strict=True):
+                    buffer.copy_(torch.from_numpy(np.asarray(value[i])))
+                row = pytree.tree_map(lambda x, i=i: x[i : i + 1], given)
+                try:
+                    output = invoke(self.module, row, (), False)
+                except (Exception, SystemExit) as error:
+                    raise self._failure(error) from error
+                if not isinstance(output, torch.Tensor):
+                    raise PolicyError(
+                        f"{self._who} returned a {type(output).__name__}; forward must return one "
+                        "tensor"
+                    )
+                output = output.float() if output.is_floating_point() else output
+                outputs.append(output.cpu().numpy().copy())
+                # A module may have put another tensor in the place of a buffer.
+                now = dict(self.module.named_buffers())
+                after.append([now[k].to(torch.float64).cpu().numpy().copy() for k in self.buffers])
+        return np.concatenate(outputs), [np.stack(x) for x in zip(*after, strict=True)]
 
     def normalized(self) -> dict[str, tuple[Array, Array]]:
         """Return the mean and deviation of a submodule that normalizes, as rsl_rl writes it.
@@ -192,7 +243,10 @@ class TorchPolicy(MappedPolicy):
                     f"{self._who}: its state {name!r} is a {type(value).__name__}, no tensor"
                 )
         # Clones: modules may share tensors, which the format does not support.
-        return safetensors.torch.save({k: v.detach().cpu().clone() for k, v in state.items()})
+        copies = {name: value.detach().cpu().clone() for name, value in state.items()}
+        for name in set(self.buffers) & copies.keys():  # where it acted last is no weight
+            copies[name].zero_()
+        return safetensors.torch.save(copies)
 
     def restored(self, content: bytes) -> Self:
         """Return a copy with these weights.
@@ -230,6 +284,7 @@ def from_torch(
     chunk: int | None = None,
     state: Any = None,
     anew: Any = (),
+    entry: int = 0,
     observation_space: Any = None,
     action_space: Any = None,
     learn: Literal[False] = False,
@@ -258,6 +313,7 @@ def from_torch(
     chunk: int | None = None,
     state: Any = None,
     anew: Any = (),
+    entry: int = 0,
     observation_space: Any = None,
     action_space: Any = None,
     learn: bool = False,
@@ -289,10 +345,13 @@ def from_torch(
         every: each action is held for this number of steps.
         chunk: the number of actions that are used of each output (n, H, ...).
         state: the shape of a recurrent state, None as the axis of the environments: (1, None, 64);
-            or a list of shapes, for a tuple of tensors. It starts with zeros.
+            or a list of shapes, for a tuple of tensors; or the names of the buffers in which a
+            module keeps it, ("hidden_state", "cell_state"). It starts with zeros.
         anew: what begins anew where the skill is called again at once: "state", "last_action",
-            "held" (of ``every`` and ``chunk``), or several. The rest goes on, clocks too; after
-            another skill's call all begins anew.
+            "held" (of ``every`` and ``chunk``), "elapsed" (clocks, tables and ``call``), "history",
+            or several. The rest goes on; after another skill's call all begins anew.
+        entry: the step at which time starts where the skill takes over, of ``Elapsed``, ``Table``
+            and ``call`` in ``sees``: a motion is entered in its middle.
         observation_space: None: the environment's.
         action_space: None: the environment's.
         learn: the skill learns on from the module.
@@ -306,7 +365,9 @@ def from_torch(
         PolicyError: the file is not trusted, or holds no module; or the module cannot learn on.
         RunError: the file does not exist.
     """
-    mapping = mapping_of("from_torch()", sees, goal, acts, every, chunk, state, anew=anew)
+    mapping = mapping_of(
+        "from_torch()", sees, goal, acts, every, chunk, state, anew=anew, entry=entry
+    )
     fitted(bool, learn, "from_torch(): learn")
     if learn and mapping != PolicyMapping():
         raise DeclarationError(
