@@ -239,6 +239,8 @@ class _Graph:
                 self._refuse(f"its {kind} multiplies by something that is no constant")
             bias = (node, 2) if kind == "Gemm" and len(node.input) > 2 and node.input[2] else None
             return _Step("linear", node, bias=bias), first
+        if kind == "Mul" and (found := self._product(name)) is not None:
+            return _Step("activation", node, found[0]), found[1]
         if len(moving) == 1 and len(node.input) == 2:
             at = 1 if first in self._moving else 0
             layer = self._made_by.get(moving[0])
@@ -249,8 +251,6 @@ class _Graph:
             value = self._constant(node.input[at])
             if value is not None and (at == 1 or kind in ("Add", "Mul")):
                 return _Step("constant", node, value=value), moving[0]
-        if kind == "Mul" and (found := self._product(name)) is not None:
-            return _Step("activation", node, found[0]), found[1]
         self._refuse(f"its {kind} is used in another way")
         raise AssertionError
 
