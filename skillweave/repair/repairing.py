@@ -29,8 +29,10 @@ from skillweave.repair.repair_stage import (
     measure,
     rehearsed_obs,
 )
+from skillweave.policies.untrusted import read_file
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.initial_policies import copy_file, file_path
 from skillweave.runs.manifest import Manifest, RepairEntry, StageEntry
 from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.skills.learnable import learn_on
@@ -146,6 +148,9 @@ def _repaired(
         """Write the policies of the stages that are done, and the observations of a rehearsal."""
         for stage, by_name in policies.items():
             run.save_policies(stage, by_name)
+        for path in roles.files():
+            if source.is_dir() and file_path(source, path).exists():
+                copy_file(run, path, read_file(file_path(source, path)))
         if rehearsal is not None:
             save_rehearsal(run, entry.name, rehearsal)
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -19,6 +20,7 @@ from skillweave import PPO, EnvSpec, Hierarchy, Network, from_function
 from skillweave.api.player import Player
 from skillweave.cli import main
 from skillweave.errors import DeclarationError
+from skillweave.export.runner import Runner
 from skillweave.hierarchy.policy import HierarchyPolicy
 
 torch.set_num_threads(1)
@@ -45,6 +47,57 @@ def test_a_run_acts_and_forgets_when_told(tmp_path: Path) -> None:
     assert [run.act(obs) for _ in range(4)] == [0, 0, 0, 2]
     other = run.player()  # has a memory of its own
     assert [other.act(obs), run.act(obs)] == [0, 2]
+
+
+class Up(Counter):
+    policy = from_function(lambda obs: np.full(len(obs), 2))
+
+
+class Down(Left):
+    max_steps = 3
+    policy = from_function(lambda obs: np.zeros(len(obs), np.int64))
+
+
+def remote() -> Hierarchy:
+    return Hierarchy(
+        EnvSpec(Walk, engine="sync"),
+        [Down(), Up()],
+        selector=lambda obs: ["up"] * len(obs),
+        learn="apart",
+    )
+
+
+@pytest.mark.parametrize("exported", [False, True])
+def test_the_caller_names_the_skill(tmp_path: Path, exported: bool) -> None:
+    run = remote().train(tmp_path / "run", quiet=True)
+    obs = np.zeros(4, np.float32)
+    player: Any = run.player()
+    if exported:
+        pytest.importorskip("onnxscript")
+        run.export(tmp_path / "out")
+        given = {
+            "selector": lambda obs: ["up"] * len(obs),
+            "down.policy": lambda obs: np.zeros(len(obs), np.int64),
+            "up.policy": lambda obs: np.full(len(obs), 2),
+            "up.termination": Up().termination,
+        }
+        player = Runner(tmp_path / "out", code=given)
+    assert player.act(obs) == 2
+    assert [player.act(obs, skill="down") for _ in range(2)] == [0, 0]
+    assert player.memory["elapsed"].tolist() == [1]  # the same name goes on
+    assert player.act(obs, skill="down") == 0
+    assert player.memory["elapsed"].tolist() == [2]
+    assert player.act(obs, skill="down") == 0  # it ended after 3 steps, and is called again
+    assert player.memory["elapsed"].tolist() == [0]
+    assert player.act(obs) == 0  # without a name, its call goes on until it ends
+    assert [player.act(obs, skill="up"), player.act(obs)] == [2, 2]
+    player.reset()
+    assert player.act(obs, skill="down") == 0
+    with pytest.raises(Exception, match="skill is 'dwon'; it must be one of 'down', 'up'"):
+        player.act(obs, skill="dwon")
+    alone = run.player(skill="up")
+    with pytest.raises(DeclarationError, match="no skills to choose from"):
+        alone.act(obs, skill="up")
 
 
 def test_parts_of_an_observation_may_come_in_any_order() -> None:
