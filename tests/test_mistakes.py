@@ -42,6 +42,11 @@ HER = sw.SAC(num_envs=4, learning_starts=10, hindsight=True)
 FAST: dict[str, Any] = {"steps": 256, "learn": "apart", "algorithm": SMALL, "selector": SMALL}
 
 
+def learning(**how):
+    """A file that is to learn on, with a mapping that it cannot have: it is not opened."""
+    return sw.from_onnx("m.onnx", **({"learn": True} | how))
+
+
 class Good(sw.Skill):
     def reward(self, step):
         return step.next_obs[:, 0]
@@ -861,6 +866,21 @@ IN_ROOMS: list[tuple[str, Callable[[], Any], str]] = [
         "has a policy, but is none",
     ),
     ("DeclarationError", lambda: cranes(skill(policy=arm())), "is the skill 'arm'"),
+    ("DeclarationError", lambda: learning(sees=("a", sw.LastAction())), "LastAction(), but"),
+    ("DeclarationError", lambda: learning(sees=(sw.Elapsed(),)), "sees has Elapsed"),
+    ("DeclarationError", lambda: learning(sees=(sw.Table([[1.0]]),)), "sees has Table"),
+    ("DeclarationError", lambda: learning(sees=(sw.Part("a", history=3),)), "sees has history"),
+    (
+        "DeclarationError",
+        lambda: learning(sees=(lambda obs, call: call.steps,)),
+        "a function with call",
+    ),
+    ("DeclarationError", lambda: learning(every=2), "every is given"),
+    ("DeclarationError", lambda: learning(chunk=4), "chunk is given"),
+    ("DeclarationError", lambda: learning(state={"h": "g"}), "state is given"),
+    ("DeclarationError", lambda: learning(acts=sw.Acts(ramp=5)), "acts has ramp"),
+    ("DeclarationError", lambda: learning(acts=sw.Acts(to=(0,), rest=0.0)), "acts has to or rest"),
+    ("DeclarationError", lambda: learning(learn="yes"), "learn is 'yes'"),
     (
         "DeclarationError",
         lambda: sw.Residual(sw.from_torch(torch.nn.Linear(3, 3), learn=True)),

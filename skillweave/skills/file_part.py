@@ -86,8 +86,9 @@ def file_input(
         given["goal"] = (space_of(goal_space).size,)
     elif mapping.goal is not None:
         given["goal"] = np.asarray(mapping.goal).shape
-    inputs = fitted_inputs(mapping, space, who, given)
-    (whole,) = for_model(inputs, {file.input: file.shape}, who).values()
+    plain = fitted_inputs(replace(mapping, scaling={}), space, who, given)
+    for_model(plain, {file.input: file.shape}, who)  # before the normalisation in the file
+    (whole,) = fitted_inputs(mapping, space, who, given).values()
     if not places:
         return FileInput(whole, None)
     return _without_goal(whole, places[0], mapping, goal_space, who)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -501,6 +502,53 @@ def test_other_networks_are_refused_by_name(tmp_path, words):
     path = onnx_model(tmp_path / "m.onnx", nodes, inputs, {"action": [1, 2]}, LAYER | more)
     with pytest.raises(PolicyError, match=words):
         sw.from_onnx(path, learn=True)
+
+
+TOO_WIDE = gym.spaces.Box(-2, 2, (2,), np.float32)
+GIVEN: dict[str, Any] = {
+    "sees and acts, but its policy": ({}, {"sees": "gyro", "acts": (0,)}),
+    "takes no goal, but its skill has goals": (
+        {"sees": ("joints", "joints")},
+        {"goal_space": GOALS},
+    ),
+    "sees has Goal() 2 times": ({"sees": (sw.Goal(), sw.Goal(), "joints")}, {"goal_space": GOALS}),
+    "there is no goal: give goal=": ({"sees": (sw.Goal(), "gyro", "joints")}, {}),
+    "nothing but Goal()": ({"sees": sw.Goal(), "goal": (0.0,) * 8}, {}),
+    "Goal has a clip": (
+        {"sees": (sw.Goal(clip=(-1, 1)), "gyro", "joints")},
+        {"goal_space": GOALS},
+    ),
+    "give goal_space that range": (
+        {"sees": (sw.Goal(low=-1, high=1), "gyro", "joints")},
+        {"goal_space": TOO_WIDE},
+    ),
+    "2 stay unset": ({"sees": ("gyro", "joints")}, {}),
+    "sees has the inputs 'time_step'": ({"sees": {"time_step": "gyro"}}, {}),
+    "let sees= give the parts": ({}, {}),
+    "observation_space": ({"observation_space": GOALS, "sees": ("joints", "joints")}, {}),
+    "it scales 2": ({"sees": ("joints", "joints"), "acts": sw.Acts(scale=(1, 2, 3))}, {}),
+}
+
+
+@pytest.mark.parametrize("words", GIVEN)
+def test_mappings_that_do_not_fit_are_refused_by_name(tmp_path, words):
+    path = robot_file(tmp_path / "walk.onnx", "elu", "", 8)
+    how, fields = GIVEN[words]
+    with pytest.raises(DeclarationError, match=re.escape(words)):
+        robot(skills_of(sw.from_onnx(path, learn=True, **how), **fields)).train(
+            tmp_path / "run", quiet=True
+        )
+
+
+def test_what_else_a_file_cannot_do(tmp_path):
+    path = robot_file(tmp_path / "walk.onnx", "elu", "tanh", 8)
+    walk = sw.from_onnx(path, sees=("joints", "joints"), learn=True)
+    with pytest.raises(DeclarationError, match="ends in Tanh, which logits"):
+        robot(skills_of(walk), action=gym.spaces.Discrete(2)).train(tmp_path / "run", quiet=True)
+    with pytest.raises(DeclarationError, match="learns on by PPO"):
+        robot(skills_of(walk, algorithm=sw.SAC())).train(tmp_path / "run", quiet=True)
+    with pytest.raises(DeclarationError, match="write it as the skill's policy"):
+        sw.train_agent(lambda: World(SPACE, PUSH), SMALL, 32, start_from=walk, quiet=True)
 
 
 def test_nan_in_a_file_and_an_output_without_a_name(tmp_path):
