@@ -22,6 +22,7 @@ from skillweave.hierarchy.assembly import parts_of
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles, roles_of
+from skillweave.policies.untrusted import read_file
 from skillweave.repair.repair_stage import (
     FEWEST,
     Measured,
@@ -29,7 +30,6 @@ from skillweave.repair.repair_stage import (
     measure,
     rehearsed_obs,
 )
-from skillweave.policies.untrusted import read_file
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.initial_policies import copy_file, file_path

@@ -321,6 +321,8 @@ class Learnable:
         """
         from skillweave.spaces import same_space
 
+        if self.file is not None:  # its own part checks them
+            return
         for what, mine, theirs in (
             ("observation_space", self.observation_space, observation_space),
             ("action_space", self.action_space, action_space),

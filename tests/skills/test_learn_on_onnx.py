@@ -340,7 +340,7 @@ CASES = {
 def test_it_begins_as_the_file_and_goes_home_as_it_acts(tmp_path, file, case):
     given, goal_space, goal = CASES[case]
     path = robot_file(tmp_path / "walk.onnx", *FILES[file])
-    how = {"sees": SEES, "acts": ACTS, **given}
+    how = {"sees": SEES, "acts": ACTS, "observation_space": SPACE, "action_space": PUSH, **given}
     if file == "tanh":  # nothing is cut inside of [-1, 1] where a clip is left out
         how["acts"] = replace(ACTS, clip=None)
     ready = robot(skills_of(sw.from_onnx(path, **how), goal_space)).train(
