@@ -16,6 +16,7 @@ from skillweave.cli.commands import all_commands
 README = ROOT / "README.md"
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 NEEDS = {
+    "docs/howto/start-from.md": ("stable_baselines3", "onnx", "onnxruntime", "onnxscript"),
     "docs/tutorials/first-hierarchy.md": ("Box2D",),
     "docs/tutorials/foreign-skills.md": ("stable_baselines3", "onnx", "onnxruntime"),
     "docs/tutorials/sharing.md": ("huggingface_hub",),
