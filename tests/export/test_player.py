@@ -16,7 +16,7 @@ import torch
 from random_networks import NESTED, agent, one_by_one
 from reference_calls import Counter, Left, Walk
 
-from skillweave import PPO, EnvSpec, Hierarchy, Network, from_function
+from skillweave import PPO, EnvSpec, Hierarchy, Lengths, Network, Reflex, from_function
 from skillweave.api.player import Player
 from skillweave.cli import main
 from skillweave.errors import DeclarationError
@@ -98,6 +98,26 @@ def test_the_caller_names_the_skill(tmp_path: Path, exported: bool) -> None:
     alone = run.player(skill="up")
     with pytest.raises(DeclarationError, match="no skills to choose from"):
         alone.act(obs, skill="up")
+
+
+def test_a_named_skill_has_the_longest_length_and_reflexes_act(tmp_path: Path) -> None:
+    still = Reflex(lambda obs: obs[:, 0] > 0.5, action=1)
+    hierarchy = Hierarchy(
+        EnvSpec(Walk, engine="sync", check_seed=False),
+        [Down(), Up()],
+        selector=PPO(num_envs=2, n_steps=8),
+        call_steps=Lengths(2, 5),
+        reflexes=[still],
+        steps=64,
+        learn="apart",
+    )
+    player = hierarchy.train(tmp_path / "run", quiet=True).player()
+    obs = np.zeros(4, np.float32)
+    assert player.act(obs, skill="up") == 2
+    assert player.memory["length"].tolist() == [5]
+    obs[0] = 1.0
+    assert player.act(obs, skill="down") == 1
+    assert player.memory["skill"].tolist() == [0]
 
 
 def test_parts_of_an_observation_may_come_in_any_order() -> None:

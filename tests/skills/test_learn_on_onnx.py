@@ -450,6 +450,32 @@ def test_two_skills_learn_together_and_export(tmp_path):
     assert run.save_onnx("run", tmp_path / "r.onnx").exists()
 
 
+def test_a_skill_of_an_inner_hierarchy_goes_home_and_no_other_mapping_loads(tmp_path):
+    path = robot_file(tmp_path / "walk.onnx", "elu", "", 8)
+
+    def declared(scale):
+        sees = (sw.Part("joints", scale=scale), "joints")
+        walk = skills_of(sw.from_onnx(path, sees=sees, learn=True), steps=32)
+        env = sw.EnvSpec(lambda: World(SPACE, PUSH), engine="sync", workers=1)
+        how = {"learn": "apart", "call_steps": 5, "algorithm": SMALL}
+        inner = sw.Hierarchy(env, [walk], selector=lambda obs: ["walk"] * len(obs), **how)
+        skills = [inner.as_skill("inner")]
+        return sw.Hierarchy(env, skills, selector=lambda obs: ["inner"] * len(obs), **how)
+
+    run = declared(0.5).train(tmp_path / "run", quiet=True)
+    again = run.save_onnx("inner/walk", tmp_path / "2.onnx")
+    obs = observations(5)
+    given = np.stack([np.concatenate([0.5 * x["joints"], x["joints"]]) for x in obs])
+    session = ort.InferenceSession(str(again))
+    (wanted,) = zip(*(session.run(None, {"obs": row[None]}) for row in given), strict=True)
+    player = run.player(skill="inner/walk")
+    acts = [player.act(x) for x in obs]
+    wanted = np.concatenate(wanted).clip(PUSH.low, PUSH.high)
+    np.testing.assert_allclose(acts, wanted, atol=1e-5, rtol=1e-5)
+    with pytest.raises(RunError, match="learns_on"):
+        declared(0.4).load(tmp_path / "run")
+
+
 # Refusals -------------------------------------------------------------------------------------
 
 LAYER: dict[str, Any] = {"w": np.eye(3, 2, dtype=np.float32), "b": np.zeros(2, np.float32)}
