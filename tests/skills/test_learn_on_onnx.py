@@ -15,6 +15,9 @@ from toys import World
 
 import skillweave as sw
 from skillweave.errors import DeclarationError, PolicyError, RunError
+from skillweave.policies.mapped import Outputs
+from skillweave.policies.parts import Slice
+from skillweave.policies.spaces import space_of
 from skillweave.skills.learnable import GoalColumns, Layers
 from skillweave.skills.onnx_layers import read_network, rewritten
 
@@ -241,6 +244,20 @@ def test_the_columns_of_a_goal_by_hand():
         home = one.unfold(there, layers)
         assert home.weights[0].tolist() == layers.weights[0].tolist()
         assert home.biases[0].tolist() == [10.0]
+
+
+def test_outputs_are_written_as_actions_and_read_back_by_hand():
+    space = space_of(gym.spaces.Box(-1.0, 2.0, (2,), np.float32))
+    acts = {"scale": np.array([0.5, -2.0]), "offset": np.array([0.1, 1.0]), "clip": (-3.0, 0.4)}
+    outputs = Outputs(space, to=(0, 1), **acts)
+    whole = space_of(gym.spaces.Box(-np.inf, np.inf, (2,), np.float32))
+    part = Slice(space, whole, axes=1, outputs=outputs)
+    # 0.4 * 0.5 + 0.1, and 0.4 * -2 + 1; -3 * 0.5 + 0.1 is below -1, and -1 * -2 + 1 above 2
+    written = part.write(np.float32([[5.0, 5.0], [-9.0, -1.0]]), None)
+    np.testing.assert_allclose(written, [[0.3, 0.2], [-1.0, 2.0]], atol=1e-6)
+    np.testing.assert_allclose(part.read(np.float32([[0.2, 0.6]])), [[0.2, 0.2]], atol=1e-6)
+    with pytest.raises(PolicyError, match=r"Part\.outputs"):
+        Slice(space, space_of(gym.spaces.Box(-1, 1, (3,))), axes=1, outputs=outputs)
 
 
 # Skills ---------------------------------------------------------------------------------------
