@@ -118,8 +118,7 @@ def from_deploy(
     reader.check_names(every)
     read = {name: reader.read(terms) for name, terms in groups.items()}
     gains = {
-        name: order.gains([deploy[name][i] for i in motors])  # type: ignore[literal-required]
-        for name in ("stiffness", "damping")
+        name: order.gains([deploy[name][i] for i in motors]) for name in ("stiffness", "damping")
     }
     unsaid = [*_unsaid(deploy, robot, sdk, every), *unsaid]
     return ReadMapping(path.name, read, action, gains, unsaid)
@@ -154,7 +153,8 @@ def _value(node: Any, file: str, at: str, done: dict[int, Any]) -> Any:
 
     if id(node) in done:
         return done[id(node)]
-    kind, found = node.tag.removeprefix(YAML), None
+    kind = node.tag.removeprefix(YAML)
+    found: Any = None
     if kind == "map" and isinstance(node, yaml.MappingNode):
         found = {}
         for name, inner in node.value:
