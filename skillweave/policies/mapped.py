@@ -839,8 +839,8 @@ class Mapped(RowPolicy):
 
     Its memory has, where the mapping needs them: ``state.0`` and following, the recurrent state;
     ``last``, the last output; ``phase``, the steps since the last inference; ``held``, its actions;
-    ``elapsed``, the steps since it took over, and ``elapsed.start``, the observation then;
-    ``past.0`` and following, the last numbers of an input, and ``past``, that there are some.
+    ``elapsed.steps`` since it took over, and ``elapsed.start``, the observation then;
+    ``past.0`` and following, the last numbers of an input, and ``past.known``, that there are some.
 
     Raises:
         PolicyError: its fields contradict each other.
@@ -1012,11 +1012,11 @@ class Mapped(RowPolicy):
             if value is not None:
                 memory[key][...] = value
         if self._timed:
-            memory["elapsed"] = np.full(n, self.entry)
+            memory["elapsed.steps"] = np.full(n, self.entry)
         if self.sees is not None:
             memory["elapsed.start"] = np.zeros((n, *self.sees.shape), self.sees.record)
         if self._pasts:
-            memory["past"] = np.zeros(n, bool)
+            memory["past.known"] = np.zeros(n, bool)
             for key, past in self._pasts:
                 memory[key] = np.zeros((n, past.length, past.width))
         if self._last:
@@ -1095,12 +1095,12 @@ class Mapped(RowPolicy):
 
     def _acted_in_time(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return actions (k, …) of the model, and count the step."""
-        elapsed = memory["elapsed"][rows]
+        elapsed = memory["elapsed.steps"][rows]
         if self.sees is not None:
             first = np.flatnonzero(elapsed == self.entry)
             memory["elapsed.start"][rows[first]] = obs[first]
         action = self._acted(memory, rows, obs, turn)
-        memory["elapsed"][rows] = elapsed + 1
+        memory["elapsed.steps"][rows] = elapsed + 1
         if self._over is not None and self.warn is not None and (elapsed > self._over).any():
             self.warn(
                 f"{self.who}: its table was over at step {int(self._over)} of a call that goes on: "
@@ -1152,13 +1152,13 @@ class Mapped(RowPolicy):
     def _call(self, memory: Memory, rows: Array) -> InCall:
         """Return the time since it took over."""
         start = memory["elapsed.start"][rows] if self.sees is not None else np.zeros(len(rows))
-        return InCall(read_only(memory["elapsed"][rows]), read_only(start), self.entry)
+        return InCall(read_only(memory["elapsed.steps"][rows]), read_only(start), self.entry)
 
     def _with_past(self, memory: Memory, rows: Array, numbers: dict[str, Array]) -> None:
         """Replace the numbers of inputs that have a past by those with it, and remember them."""
         assert self.inputs is not None
-        known = memory["past"][rows]
-        memory["past"][rows] = True
+        known = memory["past.known"][rows]
+        memory["past.known"][rows] = True
         for i, (name, one) in enumerate(self.inputs.items()):
             if one.past is not None:
                 kept = memory[f"past.{i}"][rows]

@@ -60,8 +60,8 @@ AGAINST = 0.6
 """The share of outputs against which their numbers move, from which the sign is."""
 MOST_PULSES = 64
 """The most outputs that are tried."""
-NOT_OBSERVED = ("Goal()", "LastAction()")
-"""Parts that are no observation: what the user wants, and what the policy did."""
+NOT_OBSERVED = ("Goal()", "LastAction()", "Elapsed()", "Table()")
+"""Parts that are no observation: what the user wants, what the policy did, and time."""
 AT_LIMIT = 0.2
 """The share of steps at the limit of the action from which an output is named."""
 
@@ -375,7 +375,10 @@ class _Seen:
         return InputSheet(policy.name, tuple(parts), limits, min(lasted, float(steps)), steps)
 
     def _width(self, name: str) -> int:
-        return sum(len(one.places) for one in self.columns if one.input == name)
+        inputs = self.acting.inputs
+        if inputs is None:
+            return sum(len(one.places) for one in self.columns)
+        return math.prod(inputs[name].shape)
 
 
 def _beside(
@@ -430,6 +433,9 @@ def _columns(inputs: Mapping[str, Input] | None, observation_space: Any) -> Iter
         first = 0
         for take in one.takes:
             places = np.arange(first, first + take.size)
+            if one.past is not None:  # of its history, what is now
+                now = np.flatnonzero(one.past.ages == 0)
+                places = now[np.argsort(one.past.columns[now])][places]
             yield ShownPart(
                 name, take.name + _places(take.places), places, slice(start, start + take.size)
             )

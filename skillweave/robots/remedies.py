@@ -20,7 +20,7 @@ from skillweave.robots.chains import OpenRobot, PlannedCall, Robot
 from skillweave.robots.counts import exact_chance
 from skillweave.robots.trial import RobotTrial
 from skillweave.skills.mapped import MappedPolicy
-from skillweave.skills.mapping import Acts
+from skillweave.skills.mapping import Acts, Elapsed, Table
 from skillweave.skills.ready import as_policy
 from skillweave.skills.skill_set import SkillSet
 
@@ -359,6 +359,10 @@ def _ways(trial: RobotTrial, i: int, j: int, instead: Mapping[str, Any]) -> Iter
             how = f"acts=sw.Acts(..., ramp={steps}) for the policy of {skill!r}"
             ramped = _with_policy(skills, j, _ramped(policy, steps))
             yield Way(f"ramp over {steps} steps", how, ramped, everywhere=True)
+    for entry in _entries(policy, trial.steps[j]):
+        how = f"entry={entry} for the policy of {skill!r}"
+        entered = _with_policy(skills, j, _entered(policy, entry))
+        yield Way(f"entry at step {entry}", how, entered, everywhere=True)
     for steps in _lengths(trial.steps[i]):
         how = f"calls of {after!r} that are {steps} steps longer"
         yield Way(f"{after} cut {steps} steps later", how, skills, later=steps)
@@ -396,6 +400,33 @@ def _ramped(policy: MappedPolicy, steps: int) -> MappedPolicy:
     ramped = copy.copy(policy)
     ramped.mapping = replace(policy.mapping, acts=replace(acts, ramp=steps))
     return ramped
+
+
+def _entries(policy: Any, steps: int) -> list[int]:
+    """Return other steps at which a motion can be entered; none for a policy without one."""
+    if not isinstance(policy, MappedPolicy):
+        return []
+    mapping = policy.mapping
+    tables = [source for source in mapping.sources() if isinstance(source, Table)]
+    clocks = [source for source in mapping.sources() if isinstance(source, Elapsed)]
+    if not mapping.timed or (clocks and all(c.period is not None for c in clocks) and not tables):
+        return []
+    later = _lengths(steps)
+    earlier = [-step for step in later if tables]
+    entries = [mapping.entry + step for step in sorted(earlier + later, key=abs)]
+    return [x for x in entries if all(_has_row(table, x) for table in tables)]
+
+
+def _has_row(table: Table, entry: int) -> bool:
+    """Return whether a table has a row for a step, and at least one after it."""
+    return 0 <= table.start + table.rate * entry < len(table.file.numbers) - 1
+
+
+def _entered(policy: MappedPolicy, entry: int) -> MappedPolicy:
+    """Return a copy of a policy that starts at another step."""
+    entered = copy.copy(policy)
+    entered.mapping = replace(policy.mapping, entry=entry)
+    return entered
 
 
 def _with_policy(skills: SkillSet, j: int, policy: Any) -> SkillSet:

@@ -383,7 +383,7 @@ class PolicyMapping:
             "every": _Steps,
             "chunk": _Steps | None,
             "anew": tuple[Anew, ...],
-            "entry": Count,
+            "entry": int,
         }
         for name, kind in kinds.items():
             object.__setattr__(self, name, fitted(kind, getattr(self, name), name))

@@ -243,7 +243,10 @@ class TorchPolicy(MappedPolicy):
                     f"{self._who}: its state {name!r} is a {type(value).__name__}, no tensor"
                 )
         # Clones: modules may share tensors, which the format does not support.
-        return safetensors.torch.save({k: v.detach().cpu().clone() for k, v in state.items()})
+        copies = {name: value.detach().cpu().clone() for name, value in state.items()}
+        for name in set(self.buffers) & copies.keys():  # where it acted last is no weight
+            copies[name].zero_()
+        return safetensors.torch.save(copies)
 
     def restored(self, content: bytes) -> Self:
         """Return a copy with these weights.

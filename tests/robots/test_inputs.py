@@ -13,6 +13,7 @@ from robots.walker import HOME, ORDER, Walker, policy_of, right, trained_on, wri
 
 import skillweave as sw
 from skillweave.errors import DeclarationError
+from skillweave.toys.balancer import Balancer
 
 pytest.importorskip("onnxruntime")
 ACTS = sw.Acts(offset=HOME)
@@ -265,3 +266,15 @@ def test_choices_whole_observations_and_mistakes(file: Path) -> None:
         sw.inputs(sw.PPO(), "CartPole-v1")
     with pytest.raises(DeclarationError, match="episodes"):
         sw.inputs(balance, "CartPole-v1", episodes=0)
+
+
+def test_of_a_history_what_is_now_is_compared() -> None:
+    """Each part has its numbers of this inference, wherever these stand in the input."""
+    how: dict[str, Any] = {"history": 3}
+    sees = (sw.Part("tilt", **how), sw.Part("gyro", order="newest", **how), "speed")
+    policy = sw.from_function(lambda x: np.zeros((len(x), 2)), sees=sees)
+    found = {part.name: part for part in sw.inputs(policy, Balancer, steps=10).parts}
+    alone = sw.from_function(lambda x: np.zeros((len(x), 2)), sees=("tilt", "gyro", "speed"))
+    for part in sw.inputs(alone, Balancer, steps=10).parts:
+        assert found[part.name].low.tolist() == part.low.tolist()
+        assert found[part.name].high.tolist() == part.high.tolist()

@@ -14,7 +14,7 @@ from robots.test_handovers import VARY, Line, moving
 import skillweave as sw
 from skillweave.errors import DeclarationError
 from skillweave.robots.measuring import MeasuredHandovers
-from skillweave.robots.remedies import APART, Effect, Remedies, Tried
+from skillweave.robots.remedies import APART, Effect, Remedies, Tried, _entries
 from skillweave.toys.balancer import Balancer
 
 
@@ -172,3 +172,35 @@ def test_mistakes_end_in_a_sentence() -> None:
         found.remedies("fast", "wave", instead={"other": 3})
     with pytest.raises(DeclarationError, match="handovers"):
         MeasuredHandovers(("a", "b"), (), 1, (1, 1)).remedies("a", "b")
+
+
+def test_a_motion_is_entered_at_other_steps_where_its_table_has_them() -> None:
+    motion = sw.Table(np.arange(200.0), start=20)
+
+    def entries(**how: Any) -> list[int]:
+        return _entries(sw.from_function(driving, **how), 80)
+
+    # Of a call of 80 steps an eighth and a quarter, earlier and later.
+    assert entries(sees=(motion, "tilt")) == [-10, 10, -20, 20]
+    assert entries(sees=(motion, "tilt"), entry=-15) == [-5, 5]
+    assert entries(sees=(motion, "tilt"), entry=165) == [155, 175, 145]
+    assert entries(sees=(sw.Elapsed(), "tilt")) == [10, 20]  # nobody knows what is before
+    assert entries(sees=(sw.Elapsed(period=9), "tilt")) == []
+    assert entries(sees="tilt") == []
+
+
+def test_another_entry_may_help() -> None:
+    """A motion whose first steps throw the robot over."""
+
+    def tracking(x: Any) -> Any:
+        return np.stack([x[:, :3] @ DRIVE[:3] + x[:, 3], np.full(len(x), 0.1)], axis=1)
+
+    pushes = np.concatenate([np.full(10, 3.0), np.zeros(200)])
+    sees = ("tilt", "gyro", "speed", sw.Table(pushes))
+    skills = {"fast": policies()["fast"], "dance": sw.from_function(tracking, sees=sees)}
+    found = sw.handovers(
+        Balancer, skills, steps=80, stays=up, calls=1, vary=VARY, quiet=True
+    ).remedies("fast", "dance", robots=8, quiet=True)
+    best = next(one for one in found.tried if one.name == "entry at step 10")
+    assert best.won == 8
+    assert best.how == "entry=10 for the policy of 'dance'"
