@@ -20,6 +20,7 @@ from skillweave.robots.robot_keys import (
     RobotKeys,
     action_places,
     checked_joints,
+    ends,
     places_by_name,
     read_robot,
 )
@@ -410,7 +411,7 @@ def _goal(deploy: Any, sources: dict[str, str], file: str) -> Goal:
 
 def _unsaid(deploy: Any, robot: RobotKeys, sdk: tuple[str, ...], terms: list[Term]) -> list[str]:
     """Return what no deploy.yaml says, beside what was noted while it was read."""
-    names = f" ({short(list(robot.joints), 120)})" if robot.joints else ""
+    names = f" ({ends(robot.joints)})" if robot.joints else ""
     found = [
         f"that a step of the environment lasts {deploy['step_dt']:g} s, the file's step_dt",
         "that the environment takes targets of joint angles, with the gains above, and has the "

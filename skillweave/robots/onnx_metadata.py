@@ -22,6 +22,7 @@ from skillweave.robots.robot_keys import (
     RobotKeys,
     action_places,
     checked_joints,
+    ends,
     places_by_name,
     read_robot,
 )
@@ -208,10 +209,10 @@ def _refuse_others(fields: Mapping[str, str], file: str) -> None:
             "from_onnx() yourself"
         )
     if missing := [name for name in NEEDED if not fields.get(name)]:
-        has = f"has {short(', '.join(fields))}" if fields else "has none"
+        has = f"has the metadata {short(', '.join(fields))}" if fields else "has no metadata"
         raise PolicyError(
-            f"{file}: metadata of mjlab and BeyondMimic have {', '.join(NEEDED)}; this {has}, "
-            f"without {missing[0]}: use from_deploy(), or write sees= and acts= of from_onnx()"
+            f"{file} {has}; {missing[0]} is missing of {', '.join(NEEDED)}, which mjlab and "
+            "BeyondMimic write: use from_deploy(), or write sees= and acts= of from_onnx()"
         )
 
 
@@ -267,7 +268,7 @@ def _joint_order(
         there = ()  # the model's joints are not those of the observation
     if not there:
         places = tuple(range(len(wanted)))
-        text = f"that the environment's joints are in the file's order ({short(list(wanted), 120)})"
+        text = f"that the environment's joints are in the file's order ({ends(wanted)})"
         return JointOrder(places, len(wanted), pose, sources), [f"{text}: give joints="]
     places = places_by_name(wanted, there, f"{file}: joint_names", robot.name)
     text = "that the environment's observation and action have joints in the order of its names"

@@ -137,6 +137,11 @@ def places_by_name(wanted: Sequence[str], there: Sequence[str], what: str, where
     return tuple(there.index(name) for name in wanted)
 
 
+def ends(names: Sequence[str]) -> str:
+    """Return the first and the last of names, for messages."""
+    return ", ".join(names) if len(names) < 4 else f"{names[0]}, {names[1]}, ..., {names[-1]}"
+
+
 def _more(names: Sequence[str]) -> str:
     return f" and {len(names) - 1} more" if len(names) > 1 else ""
 
