@@ -115,7 +115,7 @@ def from_metadata(
 
 @checked_names
 def reference_motion(file: str | Path, output: str) -> Array:
-    """Return the motion that lies in an ONNX file, (rows, numbers), as float64.
+    """Return the motion that lies in an ONNX file, (T, K) float64: T rows of K numbers.
 
     ```
     angles = sw.reference_motion("dance.onnx", "joint_pos")
