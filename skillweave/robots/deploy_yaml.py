@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
@@ -28,8 +28,8 @@ from skillweave.robots.terms import COMMANDS, Term, TermReader, plain
 from skillweave.schema import Count, Positive, fit, fitted
 from skillweave.skills.mapping import Acts, Elapsed, Goal
 
-MOST = 2**20
-"""The most bytes of a file."""
+MOST, MOST_VALUES = 2**20, 100_000
+"""The most bytes of a file, and values in it."""
 YAML = "tag:yaml.org,2002:"
 SLICE = f"{YAML}python/object/apply:builtins.slice"
 """The tag with which Isaac Lab writes "all joints": slice(None)."""
@@ -138,7 +138,7 @@ def _load(path: Path) -> dict[str, Any]:
         import yaml
     try:
         node = yaml.compose(read_file(path, MOST), Loader=yaml.SafeLoader)
-        data = _value(node, path.name, "", {}) if node is not None else None
+        data = _value(node, path.name, "", iter(range(MOST_VALUES))) if node is not None else None
     except yaml.YAMLError as error:
         raise RunError(f"{path.name} is no YAML: {' '.join(str(error).split())[:300]}") from error
     except (RecursionError, ValueError) as error:
@@ -148,23 +148,28 @@ def _load(path: Path) -> dict[str, Any]:
     return data
 
 
-def _value(node: Any, file: str, at: str, done: dict[int, Any]) -> Any:
-    """Return the plain value of a node of YAML; ``at`` is its field."""
+def _value(node: Any, file: str, at: str, left: Iterator[int]) -> Any:
+    """Return the plain value of a node of YAML.
+
+    Args:
+        at: its field.
+        left: has an item for each value that may follow, as aliases may repeat lists of lists.
+    """
     import yaml
 
-    if id(node) in done:
-        return done[id(node)]
+    if next(left, None) is None:
+        raise RunError(f"{file} has more than {MOST_VALUES:,} values: damaged, or another file")
     kind = node.tag.removeprefix(YAML)
     found: Any = None
     if kind == "map" and isinstance(node, yaml.MappingNode):
         found = {}
         for name, inner in node.value:
-            key = _value(name, file, at, done)
+            key = _value(name, file, at, left)
             if not isinstance(key, str | int | float | None) or key in found:
                 raise RunError(f"{file}: {at or 'the file'} has the name {short(key)} twice")
-            found[key] = _value(inner, file, f"{at}.{key}" if at else str(key), done)
+            found[key] = _value(inner, file, f"{at}.{key}" if at else str(key), left)
     elif kind == "seq" and isinstance(node, yaml.SequenceNode):
-        found = [_value(x, file, f"{at}[{i}]", done) for i, x in enumerate(node.value)]
+        found = [_value(x, file, f"{at}[{i}]", left) for i, x in enumerate(node.value)]
     elif isinstance(node, yaml.ScalarNode) and kind in ("null", "bool", "int", "float", "str"):
         found = yaml.constructor.SafeConstructor().construct_object(node)
     elif node.tag == SLICE and all(x.tag == f"{YAML}null" for x in node.value):
@@ -174,7 +179,6 @@ def _value(node: Any, file: str, at: str, done: dict[int, Any]) -> Any:
             f"{file}: {at or 'the file'} has the tag {short(node.tag)}; plain values are read, "
             "and slice(None), nothing else"
         )
-    done[id(node)] = found
     return found
 
 

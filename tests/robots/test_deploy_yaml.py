@@ -288,6 +288,9 @@ BAD = {
     "a text": (TEXT.replace("step_dt: 0.02", "step_dt: fast"), "step_dt is 'fast'"),
     "too deep": ("a: " + "[" * 5000 + "]" * 5000, "is damaged|is no YAML"),
     "too large": ("#" * 2**20 + "\n" + TEXT, "at most 1,048,576"),
+    "aliases of aliases": (
+        "a0: &a0 [1, 1]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 40)),
+        "has more than 100,000 values"),
     "LEAPP": ("models: {}\npipeline: {}\n", "so it is a LEAPP file"),
     "rl_sar": ("g1:\n  num_of_dofs: 29\n", "so it is a configuration of rl_sar"),
     "unitree_rl_gym": ("num_obs: 47\ndefault_angles: [0.1]\n", "configuration of unitree_rl_gym"),
