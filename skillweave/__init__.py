@@ -36,8 +36,13 @@ if TYPE_CHECKING:
     from skillweave.hierarchy.settings import Apart as Apart, Guide as Guide, Selection as Selection
     from skillweave.networks.config import Network as Network
     from skillweave.policies.core import Step as Step
+    from skillweave.robots.deploy_yaml import from_deploy as from_deploy
     from skillweave.robots.inputs import inputs as inputs
     from skillweave.robots.measuring import handovers as handovers
+    from skillweave.robots.onnx_metadata import (
+        from_metadata as from_metadata,
+        reference_motion as reference_motion,
+    )
     from skillweave.skills import (
         Reflex as Reflex,
         Residual as Residual,

@@ -19,6 +19,7 @@ NEEDS = {
     "docs/howto/start-from.md": ("stable_baselines3", "onnx", "onnxruntime", "onnxscript"),
     "docs/tutorials/first-hierarchy.md": ("Box2D",),
     "docs/tutorials/foreign-skills.md": ("stable_baselines3", "onnx", "onnxruntime"),
+    "docs/howto/what-a-policy-needs.md": ("yaml", "onnx", "onnxruntime"),
     "docs/tutorials/sharing.md": ("huggingface_hub",),
     "docs/tutorials/other-libraries.md": ("stable_baselines3",),
 }

@@ -64,18 +64,19 @@ NEEDED: dict[type[Any], dict[str, Any]] = {
     Range: {"low": 0.25, "high": 4.0, "scale": "linear"},
     sw.Guide: {"selector": np.sign, "target_kl": 0.1},
     sw.EnvSpec: {"env": "CartPole-v1"},
+    sw.Table: {"file": [[1.0, 2.0, 3.0]]},
     sw.Agent: {"env": "CartPole-v1", "algorithm": sw.PPO(), "steps": 8},
     sw.Hierarchy: {"env": "CartPole-v1", "skills": [Stay()]},
 }
 """Arguments without which a class cannot be made."""
 KINDS = list(dict.fromkeys([*CHECKED, *NEEDED, OffPolicy, ActorCritic, SkillCritic, Mutations]))
-OWN_TESTS = {"skills", "reflexes", "predicates", "features", "rest"}
-"""Fields of a hierarchy that have tests of their own."""
+OWN_TESTS = {"skills", "reflexes", "predicates", "features", "rest", "file"}
+"""Fields of a hierarchy, or of a table, that have tests of their own."""
 FIELDS = [
     (kind, f.name)
     for kind in KINDS
     for f in fields(kind)
-    if f.init and not (kind is sw.Hierarchy and f.name in OWN_TESTS)
+    if f.init and not (kind in (sw.Hierarchy, sw.Table) and f.name in OWN_TESTS)
 ]
 
 ODD: tuple[Any, ...] = (
@@ -100,6 +101,8 @@ BY_RULE: dict[tuple[Any, str], tuple[Any, ...]] = {
     (sw.LastAction, "clip"): (5, "x", True, [], (1.0,), (1.0, -1.0), (0.0, INF)),
     (sw.Part, "places"): _PLACES,
     (sw.Acts, "to"): _PLACES,
+    (sw.Table, "columns"): _PLACES,
+    (sw.Elapsed, "first"): _NUMBERS,
     **{(Mutations, name): _LIMITS for name in ("layers", "units", "channels", "kernels")},
     (Mutations, "ranges"): (5, "x", True, [], {"gamma": 3}, {5: Range(1, 2)}),
     (Evolution, "selection"): (5, "x", None, []),
@@ -113,13 +116,14 @@ BY_RULE: dict[tuple[Any, str], tuple[Any, ...]] = {
 UNBOUNDED = {
     *((sw.DQN, "v_min"), (sw.DQN, "v_max"), (Range, "low"), (Range, "high")),
     *((sw.SAC, "target_entropy"), (Evolution, "target")),
-    *((sw.Selection, "target_return"), (sw.Agent, "target_return")),
+    *((sw.Selection, "target_return"), (sw.Agent, "target_return"), (sw.Table, "start")),
 }
 """Numbers that may be any."""
 BESIDE: dict[tuple[type[Any], str], dict[str, Any]] = {
     (sw.DQN, "v_min"): {"v_max": 9.0},
     (sw.DQN, "v_max"): {"v_min": -9.0},
     (sw.Hierarchy, "selector"): {"learn": "apart"},
+    (sw.Elapsed, "wave"): {"period": 4.0},
 }
 """Fields without which another field cannot be set."""
 
@@ -232,7 +236,7 @@ RANGES: dict[Any, str] = {
     Share: ("target_success"),
     Positive: (
         "action_std_init actor_rate adam_eps clip_coef clip_value cpus ent_coef max_grad_norm "
-        "reference_kl target_kl update_ratio"
+        "period rate reference_kl target_kl update_ratio"
     ),
     NonNegative: (
         "action_l2 deliberation_cost end ent_coef ent_coef_final exploration_noise imitation_coef "
@@ -263,15 +267,19 @@ WORDS: dict[str, set[tuple[str, ...]]] = {
     "compile": {("auto",)},
     "device": {("cpu", "cuda", "auto")},
     "engine": {("auto", "envpool", "sync")},
+    "fill": {("first", "zeros")},
     "goal_selection_strategy": {("future", "final", "episode")},
     "keep": {("last", "best")},
     "kind": {("lstm", "gru"), ("plain", "impala")},
+    "layout": {("term", "step")},
     "learn": {("together", "apart", "apart, then together")},
     "learning_rate_schedule": {("constant", "linear"), ("constant", "linear", "kl")},
     "loss": {("huber", "mse")},
+    "order": {("oldest", "newest")},
     "planes": {("first", "last")},
     "scale": {("linear", "log", "complement")},
     "start": {("config", "random")},
+    "wave": {("sin", "cos")},
 }
 """The words that fields take, by name; PPO has one more schedule than the others."""
 

@@ -51,8 +51,10 @@ CORE = CENTRE | {"shipped", "api", "cli", "skillweave"}
 RETURNED = {
     ("api", "planning.planned_run"),
     ("api", "repair.repair_stage"),
+    ("skillweave", "robots.deploy_yaml"),
     ("skillweave", "robots.inputs"),
     ("skillweave", "robots.measuring"),
+    ("skillweave", "robots.onnx_metadata"),
 }
 ROOMS: dict[str, set[str]] = {
     "public": {"extensions"},

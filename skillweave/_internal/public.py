@@ -19,8 +19,10 @@ PUBLIC = {
         "hierarchy.settings": "Apart Guide Selection",
         "networks.config": "Network",
         "policies.core": "Step",
+        "robots.deploy_yaml": "from_deploy",
         "robots.inputs": "inputs",
         "robots.measuring": "handovers",
+        "robots.onnx_metadata": "from_metadata reference_motion",
         "skills": "Reflex Residual Skill from_function from_onnx from_sb3 from_torch tree",
         "skills.automaton": "Automaton",
         "skills.mapping": "Acts Elapsed Goal LastAction Part Table",
@@ -80,6 +82,7 @@ PUBLIC = {
         "robots.inputs": "InputPart InputSheet OutputLimits",
         "robots.measured": "Between ChainChance Entry HandoverTable Pair",
         "robots.measuring": "MeasuredHandovers",
+        "robots.read_mapping": "ReadMapping",
         "robots.remedies": "Effect Remedies Tried",
     },
     "skillweave.types": {

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         Pair as Pair,
     )
     from skillweave.robots.measuring import MeasuredHandovers as MeasuredHandovers
+    from skillweave.robots.read_mapping import ReadMapping as ReadMapping
     from skillweave.robots.remedies import (
         Effect as Effect,
         Remedies as Remedies,

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from skillweave._internal.messages import short
-from skillweave.errors import DeclarationError
+from skillweave.errors import DeclarationError, PolicyError
+from skillweave.policies.archives import numbers_in
 from skillweave.policies.core import Array, read_only
 from skillweave.policies.untrusted import checksum, read_file
 
@@ -58,7 +59,7 @@ def recording(given: Any) -> Recording:
             numbers = _read(Path(given))
         else:
             numbers = np.array(given, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, PolicyError) as error:
         raise DeclarationError(
             f"Table.file is {short(given)}, but no table of numbers can be read from it: "
             f"{str(error)[:200]}. Give a .csv or .npy file, or an array (rows, columns)"
@@ -83,7 +84,7 @@ def _read(file: Path) -> Array:
     """Return the numbers of a file, float64."""
     content = read_file(file, LARGEST)
     if file.suffix == ".npy":
-        return np.array(np.load(io.BytesIO(content), allow_pickle=False), np.float64)
+        return np.array(numbers_in(content), np.float64)
     text = content.decode("utf-8-sig")
     first, _, rest = text.partition("\n")
     cells = first.replace(";", ",").split(",")
