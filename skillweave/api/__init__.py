@@ -706,7 +706,7 @@ class TrainedPolicy:
 
         Args:
             obs: what the environment's ``reset`` or ``step`` returned.
-            **given: ``reward``, ``info``, ``mask``, ``skill``: see ``Player.act``.
+            **given: ``reward``, ``info``, ``mask``, ``skill``, ``goal``: see ``Player.act``.
 
         Returns:
             The action, as the environment takes it.

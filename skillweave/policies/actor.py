@@ -82,6 +82,7 @@ class Actor:
         info: Mapping[str, Any] | None = None,
         mask: Any = None,
         skill: str | None = None,
+        goal: Any = None,
     ) -> Any:
         """Return the action for one observation, as the environment takes it.
 
@@ -97,10 +98,13 @@ class Actor:
                 so does the same name where the call has ended; else the call goes on. Its
                 ``initiation`` is not called, and of several lengths the longest counts. None: the
                 selector chooses where the running call has ended.
+            goal: of the named skill, where it has goals (``goal_space``). Another goal than before
+                is for the running call: a new command starts no new call.
 
         Raises:
-            DeclarationError: the observation or the mask does not fit the policy, or there is no
-                such skill; the message names what does.
+            DeclarationError: the observation, the mask or the goal does not fit the policy, or
+                there is no such skill; the message names what does.
+            SkillError: the goal is out of the skill's ``goal_space``.
         """
         deployed = self._deployed
         choices = self._deployed.acts.counts
@@ -126,7 +130,12 @@ class Actor:
         if self._before is None:
             self._begin(seen)
         if skill is not None:
-            self._call(skill)
+            self._call(skill, goal, seen)
+        elif goal is not None:
+            raise DeclarationError(
+                f"act(): goal is {str(goal)[:100]}, but no skill is named: act(obs, skill=..., "
+                "goal=...)"
+            )
         action = deployed.policy.act(self.memory, ROW, seen, turn)
         self._before = seen, action
         return deployed.acts.unpacked(action[0])
@@ -134,7 +143,7 @@ class Actor:
     def _begin(self, seen: Array) -> None:
         """Prepare the memory for an episode that starts in an observation (1, …)."""
 
-    def _call(self, skill: str) -> None:
+    def _call(self, skill: str, goal: Any, seen: Array) -> None:
         """Let a skill's call go on, or start one, as the caller chooses it."""
         hierarchy = innermost(self._deployed.policy)
         if not isinstance(hierarchy, CallAndReturn):
@@ -149,15 +158,25 @@ class Actor:
                 f"{', '.join(map(repr, names))}"
             )
         number = names.index(skill)
-        if number in hierarchy.goals:
-            raise DeclarationError(
-                f"act(): skill {skill!r} has goals (goal_space), which only a selector gives: "
-                "leave out skill, or let it act alone, run.player(skill=..., goal=...)"
-            )
+        goals = hierarchy.goals.get(number)
+        if (goals is None) != (goal is None):
+            has = "no goals: leave out goal" if goals is None else "goals: act(obs, skill=, goal=)"
+            raise DeclarationError(f"act(): skill {skill!r} has {has}")
+        given: dict[int, Array] = {}
+        if goals is not None:
+            try:
+                one = np.array(goals.space.packed(goal))[None]
+            except PolicyError as error:
+                raise DeclarationError(
+                    f"act(): goal does not fit {goals.space}: {error}"
+                ) from error
+            given[number] = goals.fitted(seen, one, "act()")
         running = self.memory["skill"][0] == number and self.memory["end"][0] == RUNNING
         if not running:
             longest = (number + 1) * hierarchy.each - 1
-            hierarchy.begin(self.memory, ROW, np.array([longest]))
+            hierarchy.begin(self.memory, ROW, np.array([longest]), given)
+        elif goals is not None:
+            self.memory["goal"][str(number)][ROW] = given[number]
 
     def _seen(self, obs: Any) -> Array:
         """Return one observation as a batch of one."""

@@ -16,12 +16,13 @@ import torch
 from random_networks import NESTED, agent, one_by_one
 from reference_calls import Counter, Left, Walk
 
-from skillweave import PPO, EnvSpec, Hierarchy, Lengths, Network, Reflex, from_function
+from skillweave import PPO, EnvSpec, Hierarchy, Lengths, Network, Reflex, Skill, from_function
 from skillweave.api.player import Player
 from skillweave.cli import main
 from skillweave.errors import DeclarationError
 from skillweave.export.runner import Runner
 from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.types import Array
 
 torch.set_num_threads(1)
 
@@ -98,6 +99,43 @@ def test_the_caller_names_the_skill(tmp_path: Path, exported: bool) -> None:
     alone = run.player(skill="up")
     with pytest.raises(DeclarationError, match="no skills to choose from"):
         alone.act(obs, skill="up")
+
+
+@pytest.mark.parametrize("exported", [False, True])
+def test_a_new_command_of_a_named_skill_starts_no_new_call(tmp_path: Path, exported: bool) -> None:
+    def steer(obs: Array, goal: Array) -> Array:
+        return (goal[:, 0] > 0).astype(np.int64)
+
+    class Steer(Skill):
+        policy = from_function(steer)
+        goal_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+        call_steps = 4
+
+    def choose(obs: Array) -> list[str]:
+        return ["down"] * len(obs)
+
+    hierarchy = Hierarchy(
+        EnvSpec(Walk, engine="sync", check_seed=False), [Down(), Steer()], selector=choose
+    )
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    player: Any = run.player()
+    if exported:
+        pytest.importorskip("onnxscript")
+        code = run.export(tmp_path / "out").functions
+        player = Runner(tmp_path / "out", code=code)
+    obs = np.zeros(4, np.float32)
+    assert player.act(obs, skill="steer", goal=[0.5]) == 1
+    assert player.act(obs, skill="steer", goal=[-0.5]) == 0
+    assert player.memory["elapsed"].tolist() == [1]
+    for wrong, says in (
+        ({"skill": "steer"}, "has goals"),
+        ({"skill": "down", "goal": [0.5]}, "has no goals"),
+        ({"goal": [0.5]}, "no skill is named"),
+        ({"skill": "steer", "goal": [0.5, 1.0]}, "goal does not fit"),
+        ({"skill": "steer", "goal": [3.0]}, "out of goal_space"),
+    ):
+        with pytest.raises(Exception, match=says):
+            player.act(obs, **wrong)
 
 
 def test_a_named_skill_has_the_longest_length_and_reflexes_act(tmp_path: Path) -> None:
