@@ -72,7 +72,7 @@ def _mapped(values: Values) -> int:
     actions: int = min(values.get("chunk") or 1, LONGEST)
     numbers: int = 32 * states + 4 * actions * _bytes(values["outputs"].space)
     pasts = [one.past for one in (values.get("inputs") or {}).values() if one.past is not None]
-    numbers += sum(32 * past.length * past.width for past in pasts)
+    numbers += sum(32 * past.length * len(past.kept) for past in pasts)
     return numbers if values.get("sees") is None else numbers + 4 * _bytes(values["sees"])
 
 

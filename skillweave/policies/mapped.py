@@ -727,9 +727,9 @@ class OnnxFile(Model):
 
     def _check_first(self) -> None:
         """Raise a PolicyError where a first value does not fit the state that starts with it."""
-        shapes = {
-            name: shape for (name, _), (shape, _) in zip(self.state, self.states, strict=True)
-        }
+        states = dict(zip([name for name, _ in self.state], self.states, strict=True))
+        shapes = {name: shape for name, (shape, _) in states.items()}
+        kinds = {name: np.dtype(kind) for name, (_, kind) in states.items()}
         for name, value in self.first:
             if name not in shapes:
                 raise PolicyError(f"{self.who}: OnnxFile.first has {name!r}, which is no state")
@@ -738,6 +738,15 @@ class OnnxFile(Model):
                     f"{self.who}: the first value of {name!r} has {np.size(value)} numbers, but "
                     f"the state has the shape {shapes[name]}"
                 )
+            kind = kinds[name]
+            if kind.kind in "iu":
+                info = np.iinfo(kind)
+                fits = (value == np.rint(value)) & (value >= info.min) & (value <= info.max)
+                if not np.all(fits):
+                    raise PolicyError(
+                        f"{self.who}: the first value of {name!r} is {value}, but the state is of "
+                        f"{kind}"
+                    )
 
     def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in vars(self).items() if k not in ("opened", "_given", "_types")} | {
@@ -924,7 +933,11 @@ class Mapped(RowPolicy):
         self._timed = any(take.timed for take in self.takes)
         if any(take.takes_call for take in self.takes) and self.sees is None:
             raise PolicyError("Mapped.inputs has a function that takes call, but no Mapped.sees")
-        tables = [take.time.steps for take in self.takes if isinstance(take.time, Rows)]
+        tables = [
+            take.time.steps
+            for take in self.takes
+            if isinstance(take.time, Rows) and len(take.time.numbers) > 1
+        ]
         self._over = min(tables, default=None)
         """The step at which the first table is over."""
         self._pasts = [
@@ -1029,7 +1042,7 @@ class Mapped(RowPolicy):
         if self._pasts:
             memory["past.known"] = np.zeros(n, bool)
             for key, past in self._pasts:
-                memory[key] = np.zeros((n, past.length, past.width))
+                memory[key] = np.zeros((n, past.length, len(past.kept)))
         if self._last:
             memory["last"] = np.zeros((n, self.outputs.count), np.float64)
         if self.period > 1:
@@ -1114,8 +1127,9 @@ class Mapped(RowPolicy):
         memory["elapsed.steps"][rows] = elapsed + 1
         if self._over is not None and self.warn is not None and (elapsed > self._over).any():
             self.warn(
-                f"{self.who}: its table was over at step {int(self._over)} of a call that goes on: "
-                "its last row stays. Let the call end there (call_steps), or give more rows"
+                f"{self.who}: its table was over at step {int(self._over) - self.entry} of a call "
+                "that goes on: its last row stays. Let the call end there (call_steps), or give "
+                "more rows"
             )
             self._over = None
         return action

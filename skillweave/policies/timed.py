@@ -29,8 +29,12 @@ class Clock:
     def __post_init__(self) -> None:
         if np.ndim(self.first) != 1 or not len(self.first):
             raise PolicyError(f"Clock.first has the shape {np.shape(self.first)}, not (numbers,)")
-        if self.period is not None and not self.period > 0:
-            raise PolicyError(f"Clock.period is {self.period}; it must be more than 0")
+        if not (np.abs(self.first) < MOST).all():
+            raise PolicyError(f"Clock.first is beyond {MOST:,}, or NaN")
+        if self.period is not None and not 1 / MOST < self.period < MOST:
+            raise PolicyError(
+                f"Clock.period is {self.period}; it must be from 1/{MOST:,} to {MOST:,}"
+            )
         if self.wave and self.period is None:
             raise PolicyError(f"Clock.wave is {self.wave!r}, but there is no Clock.period")
 
@@ -44,7 +48,11 @@ class Clock:
         x: Array = elapsed[:, None] + self.first
         if self.period is None:
             return x
-        x = x % self.period
+        # The rest of a step that ends a period, 56 of 56.00000000000001, is 0 and not the period.
+        turns = x / self.period
+        whole = np.rint(turns)
+        ends = np.abs(turns - whole) < CLOSE * np.maximum(1.0, np.abs(whole))
+        x = np.where(ends, 0.0, x % self.period)
         if not self.wave:
             return x
         angle = 2.0 * np.pi / self.period * x
@@ -69,8 +77,11 @@ class Rows:
     def __post_init__(self) -> None:
         if np.ndim(self.numbers) != 2 or not np.size(self.numbers):
             raise PolicyError(f"Rows.numbers has the shape {np.shape(self.numbers)}, not (T, K)")
-        if not self.rate > 0 or not abs(self.first) < 2**31:
-            raise PolicyError(f"Rows.rate is {self.rate} and Rows.first {self.first}")
+        if not 0 < self.rate < MOST or not abs(self.first) < MOST:
+            raise PolicyError(
+                f"Rows.rate is {self.rate} and Rows.first {self.first}; they must be less than "
+                f"{MOST:,}, and the rate more than 0"
+            )
         self._last = len(self.numbers) - 1
 
     @property
@@ -126,29 +137,41 @@ class Past:
                 f"Past.columns, Past.zeros must be from 0 to {self.width - 1}, Past.ages to "
                 f"{LONGEST:,}"
             )
-        self.length = int(ages.max()) + 1
-        """The number of inferences that are kept, this one included."""
-        self._flat = ages.astype(np.int64) * self.width + columns
-        self._zeros = np.array(self.zeros, np.int64)
+        self.length = int(ages.max())
+        """The number of inferences before this one that are kept."""
+        old = ages > 0
+        columns = columns.astype(np.int64)
+        self.kept = np.unique(columns[old])
+        """The places of the numbers that are kept of each."""
+        self._old, self._now = np.flatnonzero(old), np.flatnonzero(~old)
+        self._columns = columns[self._now]
+        place = np.searchsorted(self.kept, columns[old])
+        self._flat = (ages[old].astype(np.int64) - 1) * len(self.kept) + place
+        self._zeros = np.isin(self.kept, self.zeros)
 
     def __call__(self, kept: Array, known: Array, x: Array) -> Array:
         """Return the numbers (n, S), and put those of this inference first in ``kept``.
 
         Args:
-            kept: (n, length, width), of the last inferences, the newest first.
+            kept: (n, length, numbers), of the inferences before, the newest first.
             known: (n,) bool, there was one.
             x: (n, width), of this inference.
         """
-        kept[:, 1:] = kept[:, :-1]
-        kept[:, 0] = x
+        mine = x[:, self.kept]
         if not known.all():
             first = np.flatnonzero(~known)
-            before = x[first].astype(np.float64)
-            before[:, self._zeros] = 0.0
-            kept[first, 1:] = before[:, None]
-        numbers: Array = np.take(kept.reshape(len(kept), -1), self._flat, axis=1)
+            kept[first] = np.where(self._zeros, 0.0, mine[first])[:, None]
+        numbers: Array = np.empty((len(x), len(self._old) + len(self._now)))
+        numbers[:, self._now] = x[:, self._columns]
+        numbers[:, self._old] = kept.reshape(len(kept), -1)[:, self._flat]
+        kept[:, 1:] = kept[:, :-1]
+        kept[:, :1] = mine[:, None]
         return numbers
 
 
 LONGEST = 10_000
 """The most inferences that an input remembers."""
+MOST = 2**31
+"""Steps, rows and periods are less than this."""
+CLOSE = 1e-9
+"""The relative difference of steps and periods that is rounding."""

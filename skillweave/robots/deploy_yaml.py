@@ -86,7 +86,8 @@ def from_deploy(
         file: the file, of unitree_rl_lab or unitree_rl_mjlab.
         env: an ``EnvSpec``, a Gymnasium id, or a function that makes an environment.
         names: entries of ``sees`` by the name of a term, where its key has another name, or it has
-            none: ``{"base_ang_vel": "imu"}``. Settings that an entry does not have are the file's.
+            none: ``{"base_ang_vel": "imu"}``. Settings with their defaults are the file's: what
+            differs from it, a scale of 1 too, is set in the result.
         joints: names of the joints in the order of Unitree's SDK, to which the file's
             ``joint_ids_map`` leads; the environment has names in its attribute ``joint_names``, or
             in MuJoCo's model. None: the environment's joints are in the SDK's order.

@@ -60,7 +60,9 @@ AGAINST = 0.6
 """The share of outputs against which their numbers move, from which the sign is."""
 MOST_PULSES = 64
 """The most outputs that are tried."""
-NOT_OBSERVED = ("Goal()", "LastAction()", "Elapsed()", "Table()")
+OF_TIME = ("Elapsed()", "Table()")
+"""Parts that count steps."""
+NOT_OBSERVED = ("Goal()", "LastAction()", *OF_TIME)
 """Parts that are no observation: what the user wants, what the policy did, and time."""
 AT_LIMIT = 0.2
 """The share of steps at the limit of the action from which an output is named."""
@@ -473,7 +475,8 @@ def _named(
         moved: see ``_Seen.sheet``.
         declared: ``sees`` says what they are; else nothing can be a little wrong.
     """
-    far = [_most(part.distance) for part in parts]
+    # Of a clock or a table these steps are no sample of those in the training.
+    far = [_most(part.distance) * (part.name not in OF_TIME) for part in parts]
     # A goal is what the user wants, and the last action is 0 at the start.
     own = [part.name not in NOT_OBSERVED for part in parts]
     shifts = [_most(part.shift) * mine for part, mine in zip(parts, own, strict=True)]
@@ -509,10 +512,11 @@ def _deviation(part: InputPart, place: int) -> float:
 
 def _times_smaller(parts: Sequence[InputPart], k: int) -> float:
     """Return how many times less a part varies than the others, in deviations; 0: it does not."""
+    apart = "Goal()", *OF_TIME
     moving = {
         i: (float(np.median(part.distance)), float(np.median(part.spread)))
         for i, part in enumerate(parts)
-        if part.distance is not None and part.spread is not None and part.name != "Goal()"
+        if part.distance is not None and part.spread is not None and part.name not in apart
     }
     if k not in moving or len(moving) < FEW_PARTS:
         return 0.0

@@ -14,7 +14,9 @@ from skillweave._internal.messages import short
 from skillweave._internal.notices import notice
 from skillweave.errors import PolicyError, RunError, needs_extra
 from skillweave.policies.core import Array
+from skillweave.policies.mapped import NUMBERS
 from skillweave.policies.sessions import open_session
+from skillweave.policies.timed import LONGEST
 from skillweave.policies.untrusted import check_file
 from skillweave.robots.read_mapping import ReadMapping, ReadTerm
 from skillweave.robots.robot_keys import (
@@ -65,7 +67,8 @@ def from_metadata(
         file: the ONNX file.
         env: an ``EnvSpec``, a Gymnasium id, or a function that makes an environment.
         names: entries of ``sees`` by the name of a term, where its key has another name, or it has
-            none: ``{"base_ang_vel": "imu"}``. Settings that an entry does not have are the file's.
+            none: ``{"base_ang_vel": "imu"}``. Settings with their defaults are the file's: what
+            differs from it, a scale of 1 too, is set in the result.
         joints: names of the environment's joints, as the file calls them, in the order of its
             observation and action. None: its attribute ``joint_names``, or names in MuJoCo's model.
 
@@ -82,8 +85,13 @@ def from_metadata(
     model = _open(path)
     fields = {entry.key: entry.value for entry in model.metadata_props}
     _refuse_others(fields, path.name)
-    texts = {name: fields[name].split(",") for name in ("joint_names", "observation_names")}
+    texts = {
+        name: [x.strip() for x in fields[name].split(",")]
+        for name in ("joint_names", "observation_names")
+    }
     count = len(texts["joint_names"])
+    if len(set(texts["joint_names"])) < count:
+        raise RunError(f"{path.name}: joint_names has a name twice: {short(fields['joint_names'])}")
     wide = ("default_joint_pos", "action_scale", *(x for x in GAINS.values() if x in fields))
     numbers = {name: _numbers(fields[name], name, count, path.name) for name in wide}
     names = fitted(Mapping[str, Any], names or {}, "from_metadata(): names")
@@ -122,7 +130,7 @@ def reference_motion(file: str | Path, output: str) -> Array:
     sees = (sw.Table(angles), ...)
     ```
 
-    The file is run with ``time_step`` 0, 1, 2 and on, until its rows are the last one.
+    The file is run with ``time_step`` 0, 1, 2 and on, for each row of its tables.
 
     Args:
         file: an ONNX file of mjlab or BeyondMimic, with the input ``time_step``.
@@ -130,7 +138,7 @@ def reference_motion(file: str | Path, output: str) -> Array:
 
     Raises:
         RunError: the file cannot be read.
-        PolicyError: it has no such input or output, or its rows do not end.
+        PolicyError: it has no such input or output, or this is no row of a table.
         MissingExtra: the extra 'onnx' is not installed.
     """
     path = Path(file)
@@ -141,7 +149,7 @@ def motion_of(model: Any, path: Path, outputs: Sequence[str]) -> Array:
     """Return outputs of a file by their rows, (rows, numbers of all), as float64.
 
     Raises:
-        PolicyError: it has no such input or output, or its rows do not end.
+        PolicyError: it has no such input or output, or this is no row of a table.
     """
     session = open_session(model.SerializeToString(deterministic=True), path.name)
     inputs = {entry.name: entry for entry in session.get_inputs()}
@@ -152,31 +160,66 @@ def motion_of(model: Any, path: Path, outputs: Sequence[str]) -> Array:
             f"{path.name} has no {lacks}, so no motion lies in it: it takes {', '.join(inputs)} "
             f"and returns {', '.join(there)}"
         )
-    dtypes = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(int64)": np.int64}
+    rows = _rows_of(model, path, outputs)
     feeds = {}
     for name, entry in inputs.items():
         shape = [n if isinstance(n, int) else 1 for n in entry.shape]
-        feeds[name] = np.zeros(shape, dtypes.get(entry.type, np.float32))
-
-    def row(step: int) -> Array:
-        """Return the numbers of a row."""
+        feeds[name] = np.zeros(shape, NUMBERS.get(entry.type, np.float32))
+    found = []
+    for step in range(rows):
         feeds[CLOCK] = np.full_like(feeds[CLOCK], step)
         try:
-            found = session.run(list(outputs), feeds)
+            values = session.run(list(outputs), feeds)
         except Exception as error:  # onnxruntime's own errors have no common class
             raise PolicyError(f"{path.name}: no row {step:,}: {str(error)[:200]}") from error
-        return np.concatenate([np.float64(x).reshape(-1) for x in found])
+        found.append(np.concatenate([np.float64(x).reshape(-1) for x in values]))
+    return np.array(found)
 
-    last = row(MOST_ROWS)
-    rows: list[Array] = []
-    while len(rows) < MOST_ROWS:
-        rows.append(row(len(rows)))
-        if np.array_equal(rows[-1], last):
-            # A motion may pass its last row before, or stand still: look at later ones, too.
-            later = (len(rows) - 1 + 2**k for k in range(MOST_ROWS.bit_length()))
-            if all(np.array_equal(row(step), last) for step in later if step < MOST_ROWS):
-                return np.array(rows)
-    raise PolicyError(f"{path.name}: its motion does not end within {MOST_ROWS:,} rows")
+
+def _rows_of(model: Any, path: Path, outputs: Sequence[str]) -> int:
+    """Return the rows of the tables from which outputs are gathered.
+
+    Raises:
+        PolicyError: an output is no row of a table, or depends on more than the step.
+    """
+    graph = model.graph
+    known = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
+    made_by = {name: node for node in graph.node for name in node.output}
+    for node in graph.node:
+        if node.op_type == "Constant" and node.attribute[0].name == "value":
+            known[node.output[0]] = tuple(node.attribute[0].t.dims)
+    free = {entry.name for entry in graph.input} - known.keys()
+    lengths: set[int] = set()
+    for output in outputs:
+        waiting, done = [output], set[str]()
+        gathered = False
+        while waiting:
+            name = waiting.pop()
+            if name in done or name in known:
+                continue
+            done.add(name)
+            node = made_by.get(name)
+            if node is None:
+                continue
+            if node.op_type == "Gather" and len(known.get(node.input[0], ())) > 0:
+                gathered = True
+                lengths.add(known[node.input[0]][0])
+            waiting += node.input
+        if others := sorted(done & free - {CLOCK}):
+            raise PolicyError(
+                f"{path.name}: its output {output!r} depends on {', '.join(others)}, so it is no "
+                "motion that lies in the file"
+            )
+        if not gathered:
+            raise PolicyError(
+                f"{path.name}: its output {output!r} is no row of a table in the file"
+            )
+    if len(lengths) > 1 or max(lengths) > MOST_ROWS:
+        raise PolicyError(
+            f"{path.name}: its outputs {', '.join(outputs)} are of tables with {sorted(lengths)} "
+            f"rows; one number of at most {MOST_ROWS:,} is read"
+        )
+    return lengths.pop()
 
 
 # The file
@@ -294,6 +337,11 @@ def _terms(
     past = [1] * len(names)
     if HISTORY in fields:
         found = _numbers(fields[HISTORY], HISTORY, len(names), file)
+        if any(n != int(n) or not 0 <= n <= LONGEST for n in found):
+            raise RunError(
+                f"{file}: {HISTORY} is {short(fields[HISTORY])}; it must be whole numbers from 0 "
+                f"to {LONGEST:,}"
+            )
         past = [max(1, int(n)) for n in found]
     terms = []
     for name, history in zip(names, past, strict=True):

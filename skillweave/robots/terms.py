@@ -153,8 +153,9 @@ class TermReader:
         wide = [k for k, x in term.settings.items() if isinstance(x, tuple) and k != "clip"]
         if wide or term.settings.get("history", 1) > 1:
             raise DeclarationError(
-                f"{where} has {len(entries)} entries, but {self.file} has a "
-                f"{wide[0] if wide else 'history'} of the whole term: give one entry"
+                f"{self.file} has a {wide[0] if wide else 'history'} of the whole term "
+                f"{term.name!r}, which {len(entries)} entries of sees cannot have: give one, "
+                f"names={{{term.name!r}: ...}}"
             )
         plain = replace(term, numbers=None)
         read = [self._checked(plain, self._filled(term, x, where), sources) for x in entries]

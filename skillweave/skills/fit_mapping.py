@@ -128,7 +128,7 @@ def _field(name: str) -> str:
 def described(given: Input) -> str:
     """Return how many numbers an input has, and of which sources, for messages."""
     sizes = ", ".join(f"{take.name} {take.size}" for take in given.takes)
-    several = "" if given.past is None else f", of the last {given.past.length} inferences"
+    several = "" if given.past is None else f", of the last {given.past.length + 1} inferences"
     return f"{prod(given.shape)} numbers ({shortened(sizes, 300)}{several})"
 
 
@@ -212,7 +212,8 @@ class _Reader:
             )
         if len(paths) == 1 and part.places is None:
             shape = self.leaves[paths[0]].shape
-            return [self._take(paths[0], part, alone and (len(shape) > 1 or not part.one_hot))]
+            number = not part.one_hot and part.history == 1
+            return [self._take(paths[0], part, alone and (len(shape) > 1 or number))]
         if len(paths) > 1:
             leaves = leaf_spaces(self.space)
             paths = [path for path in paths if image_layout(leaves[path]) is None]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -228,6 +228,11 @@ def as_recorded(
         if not hasattr(policy, "remapped"):
             raise RunError(f"{where} had a policy with a mapping, but now it has none")
         policy = policy.remapped(recorded.mapping, where)
+        names = ", ".join([*_changed(recorded.mapping, now.mapping)][:4])
+        notice(
+            f"{where}: the mapping of its policy is declared otherwise now ({names}); the recorded "
+            "one acts. To use the new one, train again: train(start_from=run)"
+        )
     if recorded.sha256 in (None, now.sha256):
         return policy
     if not isinstance(policy, Foreign) or (content := read()) is None:
@@ -238,6 +243,20 @@ def as_recorded(
     if checksum(content) != recorded.sha256:
         raise RunError(f"{where}: the copy of its policy is damaged: another checksum")
     return policy.restored(content)
+
+
+def _changed(then: Any, now: Any, name: str = "") -> Iterator[str]:
+    """Yield the names of settings that differ between two mappings: ``sees[0].scale``."""
+    if isinstance(then, dict | None) and isinstance(now, dict | None):
+        then, now = then or {}, now or {}
+        for key in dict.fromkeys([*then, *now]):
+            inner = f"{name}.{key}".strip(".") if key else name
+            yield from _changed(then.get(key), now.get(key), inner)
+    elif isinstance(then, list) and isinstance(now, list) and len(then) == len(now):
+        for i, (one, other) in enumerate(zip(then, now, strict=True)):
+            yield from _changed(one, other, f"{name}[{i}]")
+    elif then != now:
+        yield name
 
 
 def qualified(thing: Any) -> str:

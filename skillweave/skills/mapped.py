@@ -275,7 +275,8 @@ def look_at_outputs(policy: MappedPolicy) -> None:
             return  # it is an error where it acts
         now = twin.tensors()
         written = [k for k, x in now.items() if k not in before or not np.array_equal(x, before[k])]
-        hidden = f"{who} {hidden_state(written)}"
+        named = [*getattr(policy, "buffers", ()), *written]
+        hidden = f"{who} {hidden_state(named if written else [])}"
         if largest_difference(first, twin.outputs(obs), every):
             state.prepare()
             # With the same random numbers, only a state makes the module of the twin differ again.

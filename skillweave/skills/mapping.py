@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields, is_dataclass
+from functools import partial
 from itertools import count
 from typing import Annotated, Any, Literal
 
@@ -17,7 +18,7 @@ from skillweave._internal.messages import short
 from skillweave._internal.named import named
 from skillweave.errors import DeclarationError
 from skillweave.policies.mapped import LONGEST
-from skillweave.policies.timed import LONGEST as LONGEST_PAST
+from skillweave.policies.timed import LONGEST as LONGEST_PAST, MOST
 from skillweave.schema import Check, Count, Positive, fitted, settings
 from skillweave.skills.outputs import parameters_of
 from skillweave.skills.tables import Recording, recorded, recording
@@ -118,6 +119,14 @@ class WithPast(Scaling):
     order: Literal["oldest", "newest"] = "oldest"
     """The inference that stands first."""
 
+    def __post_init__(self) -> None:
+        given = (self.fill, self.layout, self.order) != ("first", "term", "oldest")
+        if self.history == 1 and given:
+            raise DeclarationError(
+                f"{type(self).__name__} has fill, layout or order, but a history of 1: give "
+                "history, too"
+            )
+
 
 @settings
 class Part(WithPast):
@@ -152,6 +161,7 @@ class Part(WithPast):
     ``held``. None: the offset, so the default pose."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.held_at is not None and self.held is None:
             raise DeclarationError("Part.held_at is given, but no places: give held, too")
 
@@ -172,6 +182,7 @@ class Goal(WithPast):
     """The highest goal."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if None not in (self.low, self.high) and np.any(np.array(self.low) > self.high):
             raise DeclarationError(f"Goal.low is {short(self.low)}, which is more than Goal.high")
 
@@ -250,6 +261,13 @@ class Table(Scaling):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "file", recording(self.file))
+        rows, columns = self.file.numbers.shape
+        if not -MOST < self.start < rows:
+            raise DeclarationError(f"Table.start is {self.start:g}, but the table has {rows} rows")
+        if isinstance(self.columns, tuple) and max(self.columns) >= columns:
+            raise DeclarationError(
+                f"Table.columns is {short(self.columns)}, but the table has {columns} columns"
+            )
 
 
 @settings
@@ -262,7 +280,16 @@ class Computed(Scaling):
     @property
     def takes_call(self) -> bool:
         """It has a parameter ``call``, for the time of the call."""
-        return any(p.name == "call" for p in parameters_of(self.function))
+        return takes_call(self.function)
+
+
+def takes_call(function: Any) -> bool:
+    """Return whether a user's function has a parameter ``call``, which is not set already."""
+    given = function.keywords if isinstance(function, partial) else {}
+    return "call" not in given and any(
+        p.name == "call" and p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)
+        for p in parameters_of(function)
+    )
 
 
 Source = Part | Goal | LastAction | Elapsed | Table | Computed
@@ -407,6 +434,11 @@ class PolicyMapping:
             )
         for name, parts in (self.sees or {}).items():
             _check_layout(parts, f"sees[{name!r}]" if name else "sees")
+        if callable(self.goal) and takes_call(self.goal):
+            raise DeclarationError(
+                f"goal is {function_name(self.goal)}, which takes call, and only functions in sees "
+                "get it: write the function at the place of Goal() in sees"
+            )
         if self.goal is not None and not self.goal_places:
             raise DeclarationError(
                 "goal is given, but the policy does not take it: write Goal() at its place in sees"
@@ -531,7 +563,7 @@ def as_source(value: Any, where: str, of_skill: bool = False) -> Source:
         raise DeclarationError(f"{where} has history, {_NO_TIME}: leave it out")
     if isinstance(value, Source):
         return value
-    if isinstance(value, type) and value in (Goal, LastAction, Part, Elapsed):
+    if isinstance(value, type) and value in (Goal, LastAction, Part, Elapsed, Table):
         raise DeclarationError(f"{where} is the class {value.__name__}; write {value.__name__}()")
     if isinstance(value, str):
         return Part(value)
@@ -645,12 +677,14 @@ def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
     """Return the declared recurrent state of a policy, and True if it is one array."""
     if state is None:
         return (), False
+    if (firsts := _first_values(state)) is not None:
+        return firsts, False
     if isinstance(state, Mapping) and state:
         pairs = tuple(_checked_pair(name, after) for name, after in state.items())
         if all(pair is not None for pair in pairs):
             return pairs, False
     elif are_names(state):
-        return (state,) if isinstance(state, str) else tuple(state), False
+        return tuple((name,) for name in ((state,) if isinstance(state, str) else state)), False
     elif isinstance(state, list | tuple) and state:
         single = not isinstance(state[0], list | tuple)
         shapes = (tuple(state),) if single else tuple(tuple(shape) for shape in state)
@@ -662,8 +696,25 @@ def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
         f"state is {short(state)}; it must be a shape with None as the axis of the environments, "
         "(None, 64), or a list of such shapes; of an ONNX file the name of the output that is the "
         "next state by the name of each input, {'h_in': 'h_out'}, perhaps with the value that it "
-        "starts with, {'t': ('t_next', 1.0)}; of TorchScript the names of its buffers"
+        "starts with, {'t': ('t_next', 1.0)}; of a module with buffers their names, or first "
+        "values by name, {'phase': 1.0}"
     )
+
+
+def _first_values(state: Any) -> tuple[tuple[str, Any], ...] | None:
+    """Return names of a module's buffers with their first values; None: it is another state."""
+    if not isinstance(state, Mapping) or not state:
+        return None
+    found = []
+    for name, first in state.items():
+        try:
+            value = floats(np.asarray(first, np.float64).reshape(-1))
+        except (TypeError, ValueError):
+            return None
+        if not isinstance(name, str) or isinstance(first, str | bool):
+            return None
+        found.append((name, value if np.ndim(first) else value[0]))  # type: ignore[index]
+    return tuple(found)
 
 
 def _checked_pair(name: Any, after: Any) -> tuple[Any, ...] | None:

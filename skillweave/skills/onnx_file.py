@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -200,6 +199,11 @@ def _rank(output: str, choices: bool) -> tuple[bool, ...]:
     )
 
 
+def _is_pair(pair: Any) -> bool:
+    """Return whether a part of a declared state names an input and an output."""
+    return len(pair) > 1 and all(isinstance(name, str) for name in pair[:2])
+
+
 @overload
 def from_onnx(
     path: str | Path,
@@ -293,8 +297,9 @@ def from_onnx(
             each input: ``{"h_in": "h_out"}``. It starts with zeros, or with a value that is given
             beside the name: ``{"time_step": ("next_step", 1.0)}``.
         anew: what begins anew where the skill is called again at once: "state", "last_action",
-            "held" (of ``every`` and ``chunk``), "elapsed" (clocks, tables and ``call``), "history",
-            or several. The rest goes on; after another skill's call all begins anew.
+            "held" (of ``every`` and ``chunk``), "elapsed" (clocks, tables and ``call``; with
+            ``every`` name "held", too), "history", or several. The rest goes on; after another
+            skill's call all begins anew.
         entry: the step at which time starts where the skill takes over, of ``Elapsed``, ``Table``
             and ``call`` in ``sees``: a motion is entered in its middle.
         observation_space: None: the environment's.
@@ -314,7 +319,7 @@ def from_onnx(
     mapping = mapping_of(
         "from_onnx()", sees, goal, acts, every, chunk, state, anew=anew, entry=entry
     )
-    if mapping.state and not isinstance(state, Mapping):
+    if any(not _is_pair(pair) for pair in mapping.state):
         raise DeclarationError(
             "from_onnx(): state gives shapes; name the inputs and outputs of the file: "
             "state={'h_in': 'h_out'}"

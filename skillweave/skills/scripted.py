@@ -16,7 +16,13 @@ from skillweave.policies.mapped import Function
 from skillweave.policies.parts import GOAL
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.mapped import MappedPolicy
-from skillweave.skills.mapping import PolicyMapping, are_names, mapping_of
+from skillweave.skills.mapping import (
+    PolicyMapping,
+    are_names,
+    function_name,
+    mapping_of,
+    takes_call,
+)
 from skillweave.skills.outputs import (
     Wrapped,
     as_array,
@@ -169,8 +175,9 @@ def from_function(
         state: the shape of a recurrent state, None as the axis of the environments: (None, 8); or a
             list of shapes. It starts with zeros.
         anew: what begins anew where the skill is called again at once: "state", "last_action",
-            "held" (of ``every`` and ``chunk``), "elapsed" (clocks, tables and ``call``), "history",
-            or several. The rest goes on; after another skill's call all begins anew.
+            "held" (of ``every`` and ``chunk``), "elapsed" (clocks, tables and ``call``; with
+            ``every`` name "held", too), "history", or several. The rest goes on; after another
+            skill's call all begins anew.
         entry: the step at which time starts where the skill takes over, of ``Elapsed``, ``Table``
             and ``call`` in ``sees``: a motion is entered in its middle.
         observation_space: None: the environment's.
@@ -186,10 +193,15 @@ def from_function(
         raise DeclarationError(
             f"from_function takes a function of observations, not {short(function)}"
         )
-    if are_names(state):
+    if are_names(state) or isinstance(state, Mapping):
         raise DeclarationError(
-            f"from_function(): state is {short(state)}, names of a module's buffers: give the "
-            "shape of the state, (None, 8)"
+            f"from_function(): state is {short(state)}, which has names: give the shape of the "
+            "state, (None, 8)"
+        )
+    if takes_call(function) and not (isinstance(sees, Mapping) and "call" in sees):
+        raise DeclarationError(
+            f"from_function(): {function_name(function)} takes call, which only functions in sees "
+            "get: let one of these return what the call says, as an input"
         )
     mapping = mapping_of(
         "from_function()", sees, goal, acts, every, chunk, state, anew=anew, entry=entry

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +31,12 @@ class Recording:
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Recording) and self.sha256 == other.sha256
 
+    def __deepcopy__(self, memo: Any) -> Recording:
+        return self  # it never changes
+
+    def __reduce__(self) -> Any:
+        return recording_named, (np.array(self.numbers), self.name)
+
     def __hash__(self) -> int:
         return hash(self.sha256)
 
@@ -57,6 +62,8 @@ def recording(given: Any) -> Recording:
     try:
         if isinstance(given, str | Path):
             numbers = _read(Path(given))
+        elif np.iscomplexobj(given):
+            raise ValueError("it has complex numbers")
         else:
             numbers = np.array(given, np.float64)
     except (TypeError, ValueError, PolicyError) as error:
@@ -75,25 +82,42 @@ def recording(given: Any) -> Recording:
             f"Table.file is {short(given)}, whose row {row} has {numbers[row, column]} in column "
             f"{column}; all its numbers must be finite"
         )
+    return recording_named(numbers, name)
+
+
+def recording_named(numbers: Array, name: str) -> Recording:
+    """Return a table of numbers (rows, columns), with their checksum."""
     numbers = np.ascontiguousarray(numbers)
     shape = repr(numbers.shape).encode()
     return Recording(read_only(numbers), name, checksum(shape + numbers.tobytes()))
 
 
 def _read(file: Path) -> Array:
-    """Return the numbers of a file, float64."""
+    """Return the numbers of a file, float64.
+
+    Raises:
+        ValueError: they cannot be read.
+    """
     content = read_file(file, LARGEST)
     if file.suffix == ".npy":
         return np.array(numbers_in(content), np.float64)
-    text = content.decode("utf-8-sig")
-    first, _, rest = text.partition("\n")
-    cells = first.replace(";", ",").split(",")
+    lines = content.decode("utf-8-sig").splitlines()
+    rows = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    separator = next((x for x in ";,\t" if rows and x in rows[-1]), None)
+    while rows and not any(_is_number(cell) for cell in rows[0].split(separator)):
+        del rows[0]  # names of the columns, or units
+    if rows and not all(_is_number(cell) for cell in rows[0].split(separator)):
+        raise ValueError(f"its line {rows[0][:80]!r} has numbers and other words")
+    return np.loadtxt(rows, np.float64, delimiter=separator, ndmin=2, quotechar='"')
+
+
+def _is_number(cell: str) -> bool:
+    """Return whether a cell of a line is a number."""
     try:
-        float(cells[0])
-    except ValueError:  # a line of names
-        text = rest
-    separator = ";" if ";" in first else "," if "," in first else None
-    return np.loadtxt(io.StringIO(text), np.float64, delimiter=separator, ndmin=2)
+        float(cell.strip().strip('"'))
+    except ValueError:
+        return False
+    return True
 
 
 def recorded(data: Any, known: Mapping[str, Any], where: str) -> Recording:

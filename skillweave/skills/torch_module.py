@@ -16,6 +16,7 @@ from gymnasium import Space
 
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short, shortened, suggest
+from skillweave._internal.notices import notice
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.policies.core import Array, Turn
 from skillweave.policies.mapped import invoke, of_model, parted, rows_first, states_of
@@ -24,7 +25,7 @@ from skillweave.schema import fitted
 from skillweave.skills.foreign_policy import made_up, qualified
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, layers_of, no_mapping
 from skillweave.skills.mapped import MappedPolicy, hidden_state
-from skillweave.skills.mapping import PolicyMapping, are_names, mapping_of
+from skillweave.skills.mapping import PolicyMapping, mapping_of
 
 if TYPE_CHECKING:
     from torch import nn
@@ -58,15 +59,9 @@ class TorchPolicy(MappedPolicy):
         """Its name in runs."""
         self.origin = {"file": name, "sha256": checksum(content)} if file else {}
         """The file's path and checksum; {}: it was made in memory."""
-        declared = self.mapping.state
-        self.buffers: tuple[str, ...] = declared if are_names(declared) else ()
+        self._first = _buffers_of(module, self.mapping.state, name)
+        self.buffers = tuple(self._first)
         """The names of the buffers in which its recurrent state lies; (): forward takes it."""
-        known = dict(module.named_buffers())
-        if missing := [name for name in self.buffers if name not in known]:
-            raise PolicyError(
-                f"{name} has no buffer {missing[0]!r} (state)"
-                f"{suggest(missing[0], known)}: it has {', '.join(known)[:300] or 'none'}"
-            )
 
     def __getstate__(self) -> dict[str, Any]:
         state = dict(vars(self))
@@ -125,7 +120,7 @@ class TorchPolicy(MappedPolicy):
         if written := [
             k for k, x in after.items() if k not in before or not np.array_equal(x, before[k])
         ]:
-            return PolicyError(f"{self._who} {hidden_state(written)}")
+            return PolicyError(f"{self._who} {hidden_state([*self.buffers, *written])}")
         return super()._failure(error)
 
     @property
@@ -135,6 +130,11 @@ class TorchPolicy(MappedPolicy):
             known = dict(self.module.named_buffers())
             return [(tuple(known[name].shape), np.float64) for name in self.buffers]
         return states_of(self.mapping.state)
+
+    @property
+    def first_states(self) -> Sequence[Array | None]:
+        """The values that its recurrent state starts with; None: zeros."""
+        return [*self._first.values()] if self.buffers else super().first_states
 
     def call(
         self, inputs: dict[str, Array], state: tuple[Array, ...], turn: Turn
@@ -346,10 +346,12 @@ def from_torch(
         chunk: the number of actions that are used of each output (n, H, ...).
         state: the shape of a recurrent state, None as the axis of the environments: (1, None, 64);
             or a list of shapes, for a tuple of tensors; or the names of the buffers in which a
-            module keeps it, ("hidden_state", "cell_state"). It starts with zeros.
+            module keeps it, ("hidden_state", "cell_state"). It starts with zeros; a buffer with
+            another value where that is given, {"phase": 1.0}.
         anew: what begins anew where the skill is called again at once: "state", "last_action",
-            "held" (of ``every`` and ``chunk``), "elapsed" (clocks, tables and ``call``), "history",
-            or several. The rest goes on; after another skill's call all begins anew.
+            "held" (of ``every`` and ``chunk``), "elapsed" (clocks, tables and ``call``; with
+            ``every`` name "held", too), "history", or several. The rest goes on; after another
+            skill's call all begins anew.
         entry: the step at which time starts where the skill takes over, of ``Elapsed``, ``Table``
             and ``call`` in ``sees``: a motion is entered in its middle.
         observation_space: None: the environment's.
@@ -399,6 +401,47 @@ def from_torch(
             settings=PLAIN_PPO,
         )
     return TorchPolicy(module, observation_space, action_space, mapping)
+
+
+def _buffers_of(module: nn.Module, state: Any, name: str) -> dict[str, Array | None]:
+    """Return the first values of the buffers in which a module keeps its state; None: zeros.
+
+    Args:
+        state: as declared; {} is returned where it names no buffers.
+        name: of the module, for messages.
+
+    Raises:
+        PolicyError: the module has no such buffer, or of another size.
+    """
+    if not state or not isinstance(state[0][0], str):
+        return {}
+    firsts = {name: first[0] if first else None for name, *first in state}
+    known = dict(module.named_buffers())
+    found: dict[str, Array | None] = {}
+    for buffer, first in firsts.items():
+        if buffer not in known:
+            raise PolicyError(
+                f"{name} has no buffer {buffer!r} (state){suggest(buffer, known)}: it has "
+                f"{', '.join(known)[:300] or 'none'}"
+            )
+        now = known[buffer].detach().cpu().numpy()
+        if first is None:
+            if now.any():
+                notice(
+                    f"{name}: its buffer {buffer!r} holds {short(now.reshape(-1).tolist(), 80)}, "
+                    "but a state starts with zeros: give its first value where that is meant, "
+                    f"state={{{buffer!r}: ...}}, or zeros, to start with these"
+                )
+            found[buffer] = None
+            continue
+        if np.ndim(first) and np.size(first) != now.size:
+            raise PolicyError(
+                f"{name}: the first value of {buffer!r} (state) has {np.size(first)} numbers, but "
+                f"the buffer has the shape {now.shape}"
+            )
+        several = bool(np.ndim(first))
+        found[buffer] = np.reshape(first, now.shape) if several else np.full(now.shape, first)
+    return found
 
 
 def _module_in(content: bytes, file: str) -> nn.Module:

@@ -278,3 +278,26 @@ def test_of_a_history_what_is_now_is_compared() -> None:
     for part in sw.inputs(alone, Balancer, steps=10).parts:
         assert found[part.name].low.tolist() == part.low.tolist()
         assert found[part.name].high.tolist() == part.high.tolist()
+
+
+def test_a_clock_and_a_table_are_not_far_off(tmp_path: Path) -> None:
+    """In a hundred steps a motion may stand still: that says nothing about the mapping."""
+    onnx = pytest.importorskip("onnx")
+    helper, real = onnx.helper, onnx.TensorProto.FLOAT
+    mean, spread = np.float32([0, 0, 0, 500, 0.7]), np.float32([0.1, 0.3, 0.4, 10, 0.7])
+    nodes = [
+        helper.make_node("Sub", ["obs", "mean"], ["a"]),
+        helper.make_node("Div", ["a", "spread"], ["b"]),
+        helper.make_node("MatMul", ["b", "weights"], ["actions"]),
+    ]
+    known = {"mean": mean, "spread": spread, "weights": np.zeros((5, 2), np.float32)}
+    stored = [onnx.numpy_helper.from_array(x, name) for name, x in known.items()]
+    graph = helper.make_graph(
+        nodes, "walk", [helper.make_tensor_value_info("obs", real, [1, 5])],
+        [helper.make_tensor_value_info("actions", real, [1, 2])], stored,
+    )  # fmt: skip
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    onnx.save(model, str(tmp_path / "walk.onnx"))
+    sees = ("tilt", "gyro", "speed", sw.Elapsed(), sw.Table(np.zeros(200)))
+    sheet = sw.inputs(sw.from_onnx(tmp_path / "walk.onnx", sees=sees), Balancer)
+    assert [part.why for part in sheet.parts if part.name in ("Elapsed()", "Table()")] == ["", ""]

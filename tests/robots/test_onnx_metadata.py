@@ -46,7 +46,11 @@ class Turned(Walker):
 
 
 def written(
-    path: Path, fields: Mapping[str, str] | None = None, size: int = 21, motion: bool = False
+    path: Path,
+    fields: Mapping[str, str] | None = None,
+    size: int = 21,
+    motion: bool = False,
+    angles: Any = None,
 ) -> Path:
     """Write a file whose actions are the mean of its inputs, and perhaps a motion."""
     from onnx import TensorProto, helper, numpy_helper
@@ -65,7 +69,10 @@ def written(
             helper.make_node("Cast", ["at"], ["whole"], to=TensorProto.INT64),
             helper.make_node("Squeeze", ["whole"], ["row"]),
         ]
-        for name, rows in (("joint_pos", MOTION), ("joint_vel", FASTER)):
+        for name, rows in (
+            ("joint_pos", MOTION if angles is None else angles),
+            ("joint_vel", FASTER),
+        ):
             outputs.append(value(name, TensorProto.FLOAT, [4]))
             constants.append(numpy_helper.from_array(rows, f"{name}_rows"))
             nodes.append(helper.make_node("Gather", [f"{name}_rows", "row"], [name], axis=0))
@@ -148,6 +155,12 @@ def test_a_tracked_motion_is_read_from_the_file(tmp_path: Path) -> None:
 def test_a_motion_ends_where_its_last_row_stays(tmp_path: Path) -> None:
     file = written(tmp_path / "kick.onnx", TRACK, 29, motion=True)
     assert sw.reference_motion(file, "joint_pos").tolist() == MOTION.tolist()
+    jump = MOTION.copy()
+    jump[:2] = jump[-1]  # it stands at first as it does at last
+    standing = written(tmp_path / "jump.onnx", TRACK, 29, motion=True, angles=jump)
+    assert sw.reference_motion(standing, "joint_pos").tolist() == jump.tolist()
+    with pytest.raises(PolicyError, match="its output 'actions' depends on obs"):
+        sw.reference_motion(file, "actions")
     with pytest.raises(PolicyError, match="has no output 'joints', so no motion"):
         sw.reference_motion(file, "joints")
     with pytest.raises(PolicyError, match="has no input 'time_step', so no motion"):

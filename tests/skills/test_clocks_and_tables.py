@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import pickle
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -145,9 +148,16 @@ def test_a_model_may_take_steps_as_an_axis_of_their_own(tmp_path: Path) -> None:
 def test_tables_are_read_from_files(tmp_path: Path) -> None:
     (tmp_path / "named.csv").write_text("x,y\n1,2\n3,4\n")
     (tmp_path / "plain.csv").write_text("1;2\n3;4\n")
+    (tmp_path / "tabs.csv").write_text("1\t2\n3\t4\n")
+    (tmp_path / "quoted.csv").write_text('"1","2"\n3,4\n')
+    (tmp_path / "units.csv").write_text("# made by hand\n,x\n[m],[rad]\n1,2\n3,4\n")
+    np.savetxt(tmp_path / "blanks.csv", [[1, 2], [3, 4]], header="x y")
     np.save(tmp_path / "x.npy", np.float32([[1, 2], [3, 4]]))
-    for name in ("named.csv", "plain.csv", "x.npy"):
-        assert sw.Table(tmp_path / name).file.numbers.tolist() == [[1, 2], [3, 4]]
+    for file in tmp_path.iterdir():
+        assert sw.Table(file).file.numbers.tolist() == [[1, 2], [3, 4]], file
+    (tmp_path / "mixed.csv").write_text(",2\n3,4\n")
+    with pytest.raises(DeclarationError, match="its line ',2' has numbers and other words"):
+        sw.Table(tmp_path / "mixed.csv")
 
 
 @pytest.mark.parametrize(
@@ -187,7 +197,16 @@ def test_tables_are_read_from_files(tmp_path: Path) -> None:
             ),
             "be neighbours",
         ),
-        (lambda p: sw.from_function(still, state=("h", "c")), "names of a module's buffers"),
+        (lambda p: sw.from_function(still, state=("h", "c")), "which has names"),
+        (lambda p: sw.from_function(still, state={"h": 1.0}), "which has names"),
+        (lambda p: sw.from_function(still, sees=sw.Goal(), goal=lambda obs, call: 0), "takes call"),
+        (lambda p: sw.from_function(lambda x, call=None: x), "takes call"),
+        (lambda p: sw.Part("a", fill="zeros"), "a history of 1"),
+        (lambda p: sw.Goal(order="newest"), "a history of 1"),
+        (lambda p: sw.Table([1.0, 2.0], start=2), "Table.start is 2, but the table has 2 rows"),
+        (lambda p: sw.Table([[1.0]], 1), r"Table.columns is \(1,\), but the table has 1 col"),
+        (lambda p: sw.Table([1.0 + 1j]), "complex"),
+        (lambda p: sw.from_function(still, sees=sw.Table), "is the class Table"),
         (lambda p: sw.from_function(still, sees=sw.Elapsed), r"write Elapsed\(\)"),
     ],
 )
@@ -217,8 +236,8 @@ def test_a_skill_that_learns_has_no_time_of_its_own(
 
 
 def test_what_does_not_fit_is_named() -> None:
-    with pytest.raises(PolicyError, match=r"columns is .*there are 2 numbers"):
-        inputs(sw.from_function(still, sees=sw.Table([[1.0, 2.0]], (0, 2))))
+    with pytest.raises(PolicyError, match=r"columns is slice.*there are 2 numbers"):
+        inputs(sw.from_function(still, sees=sw.Table([[1.0, 2.0]], slice(0, 3))))
     image = Dict({"a": Box(0, 255, (4, 4, 3), np.uint8)})
     with pytest.raises(PolicyError, match="history, but it keeps its shape"):
         sw.from_function(still, sees=sw.Part("a", history=2)).bind(image, ACTION, "it")
@@ -229,6 +248,10 @@ def test_a_call_that_is_longer_than_a_table_is_said_once() -> None:
     with pytest.warns(UserWarning, match="its table was over at step 1 of a call that goes on"):
         inputs(policy, ONE, TWO, THREE, THREE)
     inputs(sw.from_function(still, sees=sw.Table([1.0, 2.0])), ONE, TWO)  # as long as it is
+    inputs(sw.from_function(still, sees=sw.Table([1.0])), ONE, TWO)  # a constant
+    later = sw.from_function(still, sees=sw.Table(np.arange(9.0)), entry=7)
+    with pytest.warns(UserWarning, match="over at step 1 of a call"):
+        inputs(later, ONE, TWO, THREE)
 
 
 # Files
@@ -286,6 +309,9 @@ def test_a_run_is_not_played_with_another_table(tmp_path: Path) -> None:
         lambda: Clock(np.zeros((1, 2))),
         lambda: Clock(np.zeros(1), wave="sin"),
         lambda: Clock(np.zeros(1), period=0.0),
+        lambda: Clock(np.zeros(1), period=1e-320),
+        lambda: Clock(np.array([np.inf])),
+        lambda: Rows(np.zeros((3, 1)), rate=np.inf),
     ],
 )
 def test_damaged_fields_of_a_file_are_refused(make: Any) -> None:
@@ -299,9 +325,9 @@ def test_damaged_fields_of_a_file_are_refused(make: Any) -> None:
 class Counts(torch.nn.Module):
     """A module for one environment at a time, which counts its calls in a buffer."""
 
-    def __init__(self) -> None:
+    def __init__(self, first: float = 0.0) -> None:
         super().__init__()
-        self.register_buffer("count", torch.full((1, 1), 7.0))  # as it was saved
+        self.register_buffer("count", torch.full((1, 1), first))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         self.count[:] = self.count + x[:, :1]
@@ -324,6 +350,20 @@ def test_a_state_in_buffers_is_of_each_environment_and_starts_with_zeros(counts:
     assert action.tolist() == [[2, -2], [4, -4]]
     action, _ = policy.act(policy.start(1), obs_of(THREE))
     assert action.tolist() == [[3, -3]]
+
+
+def test_a_state_in_buffers_may_start_with_a_value() -> None:
+    how: Any = {"sees": "a"}
+    with pytest.warns(UserWarning, match=r"'count' holds \[7.0\], but a state starts with zeros"):
+        sw.from_torch(Counts(7.0), state="count", **how)
+    for first in (5.0, [5.0]):
+        policy = sw.from_torch(Counts(7.0), state={"count": first}, **how)
+        bound = policy.bind(SPACE, ACTION, "it")
+        assert bound.act(bound.start(1), obs_of(ONE))[0].tolist() == [[6, -6]]
+        data = json.loads(json.dumps(bound.mapping.to_json()))
+        assert PolicyMapping.from_json(data).to_json() == bound.mapping.to_json()
+    with pytest.raises(PolicyError, match=r"first value of 'count' \(state\) has 2 numbers"):
+        sw.from_torch(Counts(), state={"count": [1.0, 2.0]}, **how)
 
 
 def test_a_hidden_buffer_is_named_with_what_to_write(counts: Path) -> None:
@@ -372,8 +412,8 @@ def test_first_values_of_a_state_fit_it(tmp_path: Path) -> None:
     assert bound.act(bound.start(1), obs_of(ONE))[0].tolist() == [[4, 9]]  # clipped at 9
     with pytest.raises(PolicyError, match="first value of 'h' has 3 numbers"):
         sw.from_onnx(tmp_path / "adds.onnx", state={"h": ("g", (1, 2, 3))}, **how)
-    for wrong in (("g", "x"), ("g", np.nan), ("g", 1, 2), (1, "g")):
-        with pytest.raises(DeclarationError, match="state is "):
+    for wrong in (("g", "x"), ("g", np.nan), ("g", 1, 2), (1, "g"), 3.0):
+        with pytest.raises(DeclarationError, match="state "):
             sw.from_onnx(tmp_path / "adds.onnx", state={"h": wrong}, **how)
 
 
@@ -389,4 +429,38 @@ def test_a_choice_may_have_a_history() -> None:
         turn = Turn(World(np.random.default_rng(0)), None, None)
         acting.act(memory, np.array([0]), obs, turn)
         given.append(memory["past.0"][0].copy())
-    assert given[1].tolist() == [[0, 1], [1, 0]]
+    assert [x.tolist() for x in given] == [[[1, 0]], [[0, 1]]]
+
+
+def test_only_what_is_read_later_is_remembered() -> None:
+    policy = sw.from_function(still, sees=(sw.Part("b", history=400), "a"))
+    memory = policy.bind(SPACE, ACTION, "it").in_place.start(3)
+    assert memory["past.0"].shape == (3, 399, 1)
+
+
+def test_a_number_alone_may_have_a_history() -> None:
+    space = Dict({"mode": Discrete(2)})
+    how: Any = {"one_hot": False, "history": 3}
+    sw.from_function(still, sees=sw.Part("mode", **how)).bind(space, ACTION, "it").try_out()
+
+
+def test_a_period_ends_although_it_is_rounded() -> None:
+    clock = Clock(np.zeros(1), 0.56 / 0.01)  # 56.00000000000001
+    assert clock(np.array([55, 56, 57])).ravel().tolist() == [55.0, 0.0, 57 - 0.56 / 0.01]
+    assert Clock(np.zeros(1), 0.1)(np.arange(50)).max() < 1e-9
+    assert Clock(np.zeros(1), 2.5)(np.array([4])).tolist() == [[1.5]]
+
+
+def test_a_call_is_not_what_a_partial_function_has_set() -> None:
+    def aim(obs: Array, call: int) -> Array:
+        return np.full((len(obs), 1), float(call))
+
+    assert inputs(sw.from_function(still, sees=partial(aim, call=4)), ONE) == [[4]]
+
+
+def test_tables_stay_as_they_are() -> None:
+    table = sw.Table([[1.0, 2.0]])
+    for copied in (copy.deepcopy(table), pickle.loads(pickle.dumps(table))):
+        assert copied == table
+        with pytest.raises(ValueError, match="read-only"):
+            copied.file.numbers[0] = 9.0

@@ -429,7 +429,8 @@ def test_what_a_run_has_recorded_is_what_acts_whatever_the_recipe_maps_now():
     assert recorded.mapping is not None
     assert recorded.mapping["sees"][""][0]["scale"] == 2.0
     obs = observations(3, 1)[0]
-    restored = as_recorded(now, recorded, lambda: None, "runs/x: skill 'walk'")
+    with pytest.warns(UserWarning, match=r"otherwise now \(sees\[0\].scale, every\); the recorded"):
+        restored = as_recorded(now, recorded, lambda: None, "runs/x: skill 'walk'")
     np.testing.assert_array_equal(
         restored.act(restored.start(3), obs)[0], then.act(then.start(3), obs)[0]
     )
