@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from skillweave.api.loading import from_hub as from_hub, load as load
     from skillweave.api.player import Player as Player
     from skillweave.api.policies import load_policy as load_policy, save_policy as save_policy
+    from skillweave.data.dataset import Dataset as Dataset
+    from skillweave.data.recording import record as record
     from skillweave.envs.make import EnvSpec as EnvSpec
     from skillweave.errors import SkillweaveError as SkillweaveError
     from skillweave.hierarchy.settings import Apart as Apart, Guide as Guide, Selection as Selection

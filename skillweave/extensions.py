@@ -27,6 +27,7 @@ SHIPPED: Mapping[str, Mapping[str, str]] = {
         "repair": "skillweave.repair.repairing:repair",
         "repairs": "skillweave.repair.repair_stage:repairs_of",
         "report": "skillweave.html_report.single:write_report",
+        "segment": "skillweave.data.segmenting:segment",
     },
     "command": {
         "demo": "skillweave.demo.commands:DEMO",

@@ -59,7 +59,7 @@ INSIDE = {
     "Between", "Blame", "CallEnds", "CallLog", "Chain", "ChainChance", "Effect", "Entry",
     "Forecast", "InputPart", "InputSheet", "OutputLimits",
     "Handover", "HandoverTable", "MeasuredHandovers", "Pair", "PlannedRun", "ReadMapping",
-    "Remedies", "Reported", "Tried",
+    "Remedies", "Reported", "Segments", "Tried",
     "Rollout", "Run", "Sample", "Seeds", "Skill", "SkillweaveError", "Step", "adam_",
     "clip_grad_norm_", "fetch", "gae", "mask_logits", "masked_mean", "normalize", "tree",
     *HOMES["skillweave.errors"],

@@ -94,6 +94,7 @@ LACKS = {
     "demo": "command.demo",
     "compat": "command.import-agilerl",
     "robots": "command.handover command.inputs",
+    "data": "function.segment",
 }
 
 

@@ -49,8 +49,11 @@ CORE = CENTRE | {"shipped", "api", "cli", "skillweave"}
 # The only imports of an extension by the core, for types alone: what methods of ``Run`` return, and
 # a public name of the package.
 RETURNED = {
+    ("api", "data.segmenting"),
     ("api", "planning.planned_run"),
     ("api", "repair.repair_stage"),
+    ("skillweave", "data.dataset"),
+    ("skillweave", "data.recording"),
     ("skillweave", "robots.deploy_yaml"),
     ("skillweave", "robots.inputs"),
     ("skillweave", "robots.measuring"),

@@ -14,6 +14,8 @@ PUBLIC = {
         "api.player": "Player",
         "api.policies": "load_policy save_policy",
         "skills.lengths": "Lengths",
+        "data.dataset": "Dataset",
+        "data.recording": "record",
         "envs.make": "EnvSpec",
         "errors": "SkillweaveError",
         "hierarchy.settings": "Apart Guide Selection",
@@ -78,6 +80,7 @@ PUBLIC = {
         "planning.planner": "Planner",
     },
     "skillweave.reporting": {"reporting.curves_figure": "plot_curves"},
+    "skillweave.data": {"data.segmenting": "Segments"},
     "skillweave.robots": {
         "robots.inputs": "InputPart InputSheet OutputLimits",
         "robots.measured": "Between ChainChance Entry HandoverTable Pair",

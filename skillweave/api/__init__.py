@@ -97,6 +97,7 @@ from skillweave.training.stage import Together
 from skillweave.workers.cluster import Ray
 
 if TYPE_CHECKING:  # what extensions return
+    from skillweave.data.segmenting import Segments
     from skillweave.planning.planned_run import PlannedRun
     from skillweave.repair.repair_stage import Repair
 
@@ -469,6 +470,37 @@ class Hierarchy(Trainable, Declaration):
             flat=flat,
         )
         return run_of(train(self, options))
+
+    @checked_names
+    def segment(
+        self, data: Any, *, shortest: int = 1, goals: Mapping[str, Any] | None = None
+    ) -> Segments:
+        """Cut episodes that were recorded elsewhere into calls of skills, by what these declare.
+
+        In each episode, from its first step on: among the skills that may start there
+        (``initiation``), the one whose call ends with success first makes the next call; of several
+        the first in the list. Calls end as they do when skills act: by ``termination``, at a limit,
+        or with the episode. A call has succeeded where ``success`` is true at its end; of a skill
+        without it, where its ``termination`` ended it. Where no call would succeed, no skill claims
+        the step, and the next one is tried.
+
+        Args:
+            data: a ``Dataset`` of the same environment.
+            shortest: the fewest steps of a call.
+            goals: of skills that have goals, by name: a function of observations (n, *obs_shape)
+                that returns the goals (n, *goal_shape) of calls that start there. A skill without
+                one is left out.
+
+        Returns:
+            The calls, as a log too, and what the data do not show.
+
+        Raises:
+            DeclarationError: the data have other spaces, or lack a key of ``info`` that a skill
+                reads; or an argument is wrong.
+            SkillError: a method of a skill failed.
+        """
+        found: Segments = fetch("segment")(self, data, shortest=shortest, goals=goals)
+        return found
 
     def plain_agent(self, algorithm: AlgorithmConfig | None = None) -> Agent:
         """Return the flat baseline: one agent on the task itself, without skills and reflexes.
