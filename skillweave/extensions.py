@@ -22,6 +22,7 @@ GROUP = "skillweave.extensions"
 """The group of entry points by which other packages add names."""
 SHIPPED: Mapping[str, Mapping[str, str]] = {
     "function": {
+        "begin": "skillweave.data.beginning:begin",
         "explore": "skillweave.planning.explorer:Explorer",
         "plan": "skillweave.planning.planned_run:plan",
         "repair": "skillweave.repair.repairing:repair",

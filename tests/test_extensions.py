@@ -94,7 +94,7 @@ LACKS = {
     "demo": "command.demo",
     "compat": "command.import-agilerl",
     "robots": "command.handover command.inputs",
-    "data": "function.segment",
+    "data": "function.begin function.segment",
 }
 
 

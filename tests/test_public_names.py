@@ -15,8 +15,8 @@ ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NAMES = """
 Acts Agent Apart Automaton DQN Dataset Elapsed EnvSpec Goal Guide Hierarchy LastAction Lengths
-Network PPO Part Player Reflex Residual Run SAC Selection Skill SkillweaveError Step TD3 Table Together
-TrainDefaults evaluate from_deploy from_function from_hub from_metadata from_onnx from_sb3
+Network PPO Part Player Reflex Residual Run SAC Selection Skill SkillweaveError Step TD3 Table
+Together TrainDefaults evaluate from_deploy from_function from_hub from_metadata from_onnx from_sb3
 from_torch handovers inputs load load_policy record reference_motion save_policy
 train_agent tree
 """

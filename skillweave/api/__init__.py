@@ -176,6 +176,7 @@ class Agent(Trainable, PlainAgent):
         cluster: Ray | None = None,
         track: str | Sequence[str] = (),
         start_from: StartFrom = None,
+        data: Any = None,
     ) -> Run:
         """Train the agent and write everything to ``run_dir``.
 
@@ -225,6 +226,9 @@ class Agent(Trainable, PlainAgent):
                 PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
                 spaces, networks and the names of a selector's skills must be the same. In place of
                 a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
+            data: a ``Dataset`` of episodes to begin from: the actor of PPO is cloned from it
+                (behavioural cloning), then learns on. A part of the episodes is held out, and
+                judges the clone. Not where a run continues.
 
         Returns:
             The finished run.
@@ -252,6 +256,7 @@ class Agent(Trainable, PlainAgent):
             cluster=cluster,
             track=track,
             start_from=start_from,
+            data=data,
         )
         return run_of(train(self, options))
 
@@ -378,6 +383,7 @@ class Hierarchy(Trainable, Declaration):
         cluster: Ray | None = None,
         track: str | Sequence[str] = (),
         start_from: StartFrom = None,
+        data: Any = None,
         flat: bool | AlgorithmConfig = False,
     ) -> Run:
         """Train skills and selector and write everything to ``run_dir``.
@@ -435,6 +441,11 @@ class Hierarchy(Trainable, Declaration):
                 PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
                 spaces, networks and the names of a selector's skills must be the same. In place of
                 a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
+            data: a ``Dataset`` of episodes to begin from, or what ``segment`` has cut out of one:
+                skills that learn by PPO are cloned from their calls (behavioural cloning), the
+                selector from the choices, and all learn on then. A part of the episodes is held
+                out, and judges the clones. Skills that learn by other algorithms begin with
+                nothing. Not where a run continues.
             flat: train one plain agent for the same number of steps instead: the baseline. True:
                 with the settings of ``train_defaults``; or its settings.
 
@@ -467,6 +478,7 @@ class Hierarchy(Trainable, Declaration):
             cluster=cluster,
             track=track,
             start_from=start_from,
+            data=data,
             flat=flat,
         )
         return run_of(train(self, options))
@@ -1233,6 +1245,7 @@ def train_agent(
     cluster: Ray | None = None,
     track: str | Sequence[str] = (),
     start_from: StartFrom = None,
+    data: Any = None,
     target_return: float | None = None,
     target_success: float | None = None,
 ) -> Run:
@@ -1285,6 +1298,9 @@ def train_agent(
             PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
             spaces, networks and the names of a selector's skills must be the same. In place of
             a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
+        data: a ``Dataset`` of episodes to begin from: the actor of PPO is cloned from it
+            (behavioural cloning), then learns on. A part of the episodes is held out, and
+            judges the clone. Not where a run continues.
         target_return: stop early at this mean return of the periodic evaluation.
         target_success: stop early at this share of episodes with a true ``info["success"]``, or
             ``info["is_success"]`` where that is missing.
@@ -1311,6 +1327,7 @@ def train_agent(
         cluster=cluster,
         track=track,
         start_from=start_from,
+        data=data,
     )
     agent = Agent(env, algorithm, steps, target_return, target_success)
     with called_by("train_agent"):

@@ -24,6 +24,7 @@ from skillweave.calls.recorder import check_size
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.evolution.evolving import check_several, make_learner, plan
+from skillweave.extensions import fetch
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.roles import Level, roles_of
@@ -112,6 +113,15 @@ def start_run(
         start_from = options.start_from
         if start_from is None and content.hierarchy is not None and declared._starts is not None:
             start_from = declared._starts()
+        if options.data is not None:
+            cloned, says = fetch("begin")(declared, content, roles, options.data)
+            if start_from is not None and not isinstance(start_from, Mapping):
+                raise DeclarationError(
+                    "data and start_from are given: name the learners that start from a run, "
+                    'start_from={"open": run}; the others begin from the data'
+                )
+            start_from = {**cloned, **(start_from or {})}
+            note = "; ".join(filter(None, (note, says)))
         learnt, origin = starts(content, start_from, roles) if repair is None else ({}, "")
         first = repair or partial(copy_initial_policies, learnt=learnt)
         note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))

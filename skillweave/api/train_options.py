@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.api.starting import StartFrom
@@ -44,6 +44,7 @@ class TrainOptions:
     cluster: Ray | None = None
     track: Sequence[str] = ()
     start_from: StartFrom = None
+    data: Any = None
     flat: bool | AlgorithmConfig = False
 
     def __post_init__(self) -> None:

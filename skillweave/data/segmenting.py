@@ -40,11 +40,14 @@ class Segments:
     """Calls of skills that were found in episodes.
 
     Attributes:
-        log: the calls, for everything that reads ``run.calls``.
+        log: the calls, for everything that reads ``run.calls``. Only calls that succeed are found,
+            so shares of success in it say nothing.
         data: the episodes.
         skill: (T,) int64, the skill of each step; -1: no skill claims it.
         call: (T,) int64, its call in ``log``; -1: none.
         may_start: (skills,) int64, the steps before which each skill may start.
+        startable: (C, skills) bool, the skills that may start where each call does.
+        goals: by skill with goals, (C, *goal_shape); of other skills' calls it means nothing.
         left_out: skills with goals for which no goals were given.
     """
 
@@ -53,6 +56,8 @@ class Segments:
     skill: Array
     call: Array
     may_start: Array
+    startable: Array
+    goals: dict[str, Array]
     left_out: tuple[str, ...] = ()
 
     @property
@@ -431,7 +436,10 @@ class _Cuts:
         call = np.where(runs, np.cumsum(starts) - 1, -1)
         episode = np.searchsorted(data.offset, np.flatnonzero(starts), side="right") - 1
         log = replace(log, episode=episode)
-        return Segments(log, data, self.skill, call, self.may.sum(axis=0), self.left_out)
+        first = np.flatnonzero(starts)
+        goals = {self.skills.skills[i].name: goal[first] for i, goal in self.goal.items()}
+        may = self.may.sum(axis=0)
+        return Segments(log, data, self.skill, call, may, self.may[first], goals, self.left_out)
 
 
 class _LacksInfo(DeclarationError):

@@ -231,7 +231,7 @@ def as_recorded(
         names = ", ".join([*_changed(recorded.mapping, now.mapping)][:4])
         notice(
             f"{where}: the mapping of its policy is declared otherwise now ({names}); the recorded "
-            "one acts. To use the new one, train again: train(start_from=run)"
+            "one acts. To use the new one, start a new run"
         )
     if recorded.sha256 in (None, now.sha256):
         return policy

@@ -1,0 +1,137 @@
+"""Begin from data: the policies from which the learners of a new run start."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from skillweave._internal.messages import short
+from skillweave._internal.paths import AGENT
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.config import PPO, config_from_json
+from skillweave.algorithms.registry import make_algorithm
+from skillweave.data.cloning import Clone, clone
+from skillweave.data.dataset import Dataset
+from skillweave.data.segmenting import Segments, segment
+from skillweave.errors import DeclarationError
+from skillweave.experience.views import learner_obs, own_actions
+from skillweave.policies.core import Array
+from skillweave.runs.initial_policies import Learnt, options_of
+from skillweave.runs.manifest import Manifest
+from skillweave.skills.goals import goals_of
+from skillweave.spaces import action_codec
+from skillweave.training.role import Role
+
+FEWEST = 20
+"""The fewest rows from which a learner is cloned."""
+
+
+def begin(
+    declared: Any, content: Manifest, roles: Mapping[str, Role], data: Any
+) -> tuple[dict[str, Learnt], str]:
+    """Return the policies from which learners start, by name, and a sentence about each.
+
+    Args:
+        declared: a hierarchy, or a plain agent.
+        content: the manifest of the new run.
+        roles: of its learners, by path.
+        data: a ``Dataset``, or of a hierarchy the ``Segments`` that were cut out of one.
+
+    Raises:
+        DeclarationError: it is neither, or has other spaces; or nothing can be cloned from it.
+    """
+    flat = content.hierarchy is None
+    if not isinstance(data, Dataset if flat else Dataset | Segments):
+        kinds = "a Dataset" if flat else "a Dataset, or what hierarchy.segment() returned"
+        raise DeclarationError(f"data is {short(data)}; it must be {kinds}")
+    found = data if flat or isinstance(data, Segments) else segment(declared, data)
+    episodes = found.data if isinstance(found, Segments) else found
+    episodes.check_env(declared.spec)
+    learnt: dict[str, Learnt] = {}
+    notes = []
+    for name, config in _first_settings(content).items():
+        why = _why_not(config, roles[name])
+        rows = None if why else _rows(name, found, roles[name])
+        if not why and (rows is None or len(rows[0]) < FEWEST):
+            count = 0 if rows is None else len(rows[0])
+            why = f"{count} rows of it are in the data, fewer than {FEWEST}"
+        if why:
+            notes.append(f"{name} starts with nothing: {why}")
+            continue
+        assert rows is not None
+        obs, action, group, mask = rows
+        seeds = Seeds(content.seed) / name / "clone"
+        made: Clone = clone(config, obs, action, group, roles[name].spaces, seeds, mask)
+        sha256 = made.policy.source()["sha256"]
+        chooses = options_of(content, name)
+        learnt[name] = Learnt(made.policy, sha256, made.rows, episodes.name, None, chooses)
+        notes.append(f"{name} is cloned: {made}")
+    if not learnt:
+        raise DeclarationError(f"nothing can be cloned from {episodes.name}: {'; '.join(notes)}")
+    return learnt, "; ".join(notes)
+
+
+def _first_settings(content: Manifest) -> dict[str, Any]:
+    """Return the settings by which each learner learns first, by its name."""
+    found: dict[str, Any] = {}
+    for stage in content.stages:
+        for name in stage.learns:
+            given = stage.algorithms.get(name, stage.algorithm)
+            found.setdefault(name, config_from_json(given))
+    return found
+
+
+def _why_not(config: Any, role: Role) -> str:
+    """Return why a learner is not cloned; empty: it is."""
+    if role.kind == "critic":
+        return "it is a critic"
+    if not isinstance(config, PPO):
+        return f"{type(config).__name__} has no network whose actions can be cloned"
+    if make_algorithm(config, *role.spaces).memory_size:
+        return "its network has a memory"
+    if "/" in role.path:
+        return "it is in a hierarchy that is a skill"
+    if role.skill is not None and role.part is not None and role.part.base is not None:
+        return "it corrects another policy"
+    if role.kind == "selector" and role.chosen_goals:
+        return "it chooses goals, too"
+    return ""
+
+
+Rows = tuple[Array, Array, Array, Array | None]
+"""Observations, actions, groups and masks of the rows of a learner."""
+
+
+def _rows(name: str, found: Any, role: Role) -> Rows | None:
+    """Return the rows of a learner in data; None: there are none."""
+    if name == AGENT:
+        codec = action_codec(found.action_space)
+        episode = np.repeat(np.arange(len(found)), found.lengths)
+        return found.obs, codec.from_env(found.action), episode, None
+    log = found.log
+    if role.kind == "selector":
+        return _decisions(found)
+    if name not in log.skills:
+        return None
+    mine = np.flatnonzero(found.skill == log.skills.index(name))
+    data = found.data
+    goals = goals_of(role.skill)
+    goal = None if goals is None else found.goals[name][found.call[mine]]
+    obs = learner_obs(data.obs[mine], goal, goals, role.part)
+    action, possible = own_actions(data.action[mine], role.part, action_codec(role.action_space))
+    return obs[possible], action[possible], found.call[mine][possible], None
+
+
+def _decisions(found: Segments) -> Rows:
+    """Return the decisions of a selector: the skill of each call, where it starts."""
+    log = found.log
+    choice = log.skill
+    if log.lengths:
+        each = len(log.lengths)
+        # The shortest length in which the call would have ended.
+        length = np.minimum(np.searchsorted(log.lengths, log.tau), each - 1)
+        choice = choice * each + length
+    may = found.startable.repeat(max(1, len(log.lengths)), axis=1)
+    return log.start, choice, log.episode, may
