@@ -226,9 +226,11 @@ class Agent(Trainable, PlainAgent):
                 PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
                 spaces, networks and the names of a selector's skills must be the same. In place of
                 a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
-            data: a ``Dataset`` of episodes to begin from: the actor of PPO is cloned from it
-                (behavioural cloning), then learns on. A part of the episodes is held out, and
-                judges the clone. Not where a run continues.
+            data: a ``Dataset`` of episodes to begin from; of a hierarchy also what ``segment`` has
+                cut out of one. An agent that learns by PPO is cloned from the episodes (behavioural
+                cloning); skills from their calls, the selector from the choices. Then all learn on.
+                A part of the episodes is held out, and judges the clones. Learners by other
+                algorithms begin with nothing. Not where a run continues.
 
         Returns:
             The finished run.
@@ -441,11 +443,11 @@ class Hierarchy(Trainable, Declaration):
                 PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
                 spaces, networks and the names of a selector's skills must be the same. In place of
                 a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
-            data: a ``Dataset`` of episodes to begin from, or what ``segment`` has cut out of one:
-                skills that learn by PPO are cloned from their calls (behavioural cloning), the
-                selector from the choices, and all learn on then. A part of the episodes is held
-                out, and judges the clones. Skills that learn by other algorithms begin with
-                nothing. Not where a run continues.
+            data: a ``Dataset`` of episodes to begin from; of a hierarchy also what ``segment`` has
+                cut out of one. An agent that learns by PPO is cloned from the episodes (behavioural
+                cloning); skills from their calls, the selector from the choices. Then all learn on.
+                A part of the episodes is held out, and judges the clones. Learners by other
+                algorithms begin with nothing. Not where a run continues.
             flat: train one plain agent for the same number of steps instead: the baseline. True:
                 with the settings of ``train_defaults``; or its settings.
 
@@ -1298,9 +1300,11 @@ def train_agent(
             PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
             spaces, networks and the names of a selector's skills must be the same. In place of
             a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
-        data: a ``Dataset`` of episodes to begin from: the actor of PPO is cloned from it
-            (behavioural cloning), then learns on. A part of the episodes is held out, and
-            judges the clone. Not where a run continues.
+        data: a ``Dataset`` of episodes to begin from; of a hierarchy also what ``segment`` has
+            cut out of one. An agent that learns by PPO is cloned from the episodes (behavioural
+            cloning); skills from their calls, the selector from the choices. Then all learn on.
+            A part of the episodes is held out, and judges the clones. Learners by other
+            algorithms begin with nothing. Not where a run continues.
         target_return: stop early at this mean return of the periodic evaluation.
         target_success: stop early at this share of episodes with a true ``info["success"]``, or
             ``info["is_success"]`` where that is missing.

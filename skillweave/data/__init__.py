@@ -2,7 +2,8 @@
 
 ``dataset.py`` (``sw.Dataset``) holds episodes, ``minari_files.py`` reads and writes Minari's,
 ``recording.py`` (``sw.record``) plays a policy, and ``segmenting.py`` (``Hierarchy.segment``) cuts
-episodes into calls of skills. Begin with ``dataset.py``.
+episodes into calls of skills; ``beginning.py`` and ``cloning.py`` let learners begin as the
+recorded actions (``train(data=...)``). Begin with ``dataset.py``.
 """
 
 from typing import TYPE_CHECKING

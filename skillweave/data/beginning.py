@@ -61,8 +61,8 @@ def begin(
             notes.append(f"{name} starts with nothing: {why}")
             continue
         assert rows is not None
-        obs, action, group, mask = rows
         seeds = Seeds(content.seed) / name / "clone"
+        obs, action, group, mask = rows
         made: Clone = clone(config, obs, action, group, roles[name].spaces, seeds, mask)
         sha256 = made.policy.source()["sha256"]
         chooses = options_of(content, name)

@@ -46,7 +46,12 @@ class Clone:
     agrees: float | None
     """The share of held-out rows whose greedy choice is the recorded one; None: of numbers."""
 
+    held_out: bool = True
+    """Rows were held out; else there were too few groups, and the loss is of rows learnt from."""
+
     def __str__(self) -> str:
+        if not self.held_out:
+            return f"{self.rows:,} rows, of too few episodes or calls to hold any out"
         agrees = "" if self.agrees is None else f", agrees in {self.agrees:.0%}"
         return (
             f"{self.rows:,} rows, held-out loss {self.loss:.3g} (at the start {self.before:.3g})"
@@ -80,11 +85,12 @@ def clone(
     state = algorithm.init([seeds])
     first = algorithm.weights(state).get(STD)
     parts = _split(group, seeds)
-    inputs = to_tensor(np.ascontiguousarray(obs))[None]
-    actions = torch.from_numpy(np.ascontiguousarray(action))[None]
+    # Copies: the arrays of a data set cannot be written to, which tensors can.
+    inputs = to_tensor(np.array(obs))[None]
+    actions = torch.from_numpy(np.array(action))[None]
     allowed = None if mask is None else torch.from_numpy(mask)[None]
     rng = (seeds / "rows").torch()
-    if algorithm.head.squash if hasattr(algorithm.head, "squash") else False:
+    if getattr(algorithm.head, "squash", False):
         actions = torch.atanh(actions.clamp(-0.999, 0.999))
 
     def losses(leaves: Any, rows: Any) -> Any:
@@ -135,10 +141,10 @@ def clone(
             found = algorithm.actor_net(
                 leaves, algorithm.inputs(algorithm.learning_params(state), inputs[:, judges])
             )
-            some = None if allowed is None else allowed[:, judges]
-            greedy = algorithm.head.masked(found, some).argmax(-1)
+            may = None if allowed is None else allowed[:, judges]
+            greedy = algorithm.head.masked(found, may).argmax(-1)
             agrees = float((greedy == actions[:, judges]).float().mean())
-    return Clone(policy, len(learnt), after, before, agrees)
+    return Clone(policy, len(learnt), after, before, agrees, parts[0] is not parts[2])
 
 
 def _split(group: Array, seeds: Seeds) -> tuple[Array, Array, Array]:

@@ -277,13 +277,13 @@ class _Cuts:
             elapsed: (k,) steps of the call.
             start: (k,) the first step of the call.
         """
+        goal = self.goal[i][start] if i in self.goal else None
         data, skill = self.data, self.skills.skills[i]
         whole = Step(
             data.obs[rows], data.action[rows], data.next_obs[rows], data.reward[rows],
             data.terminated[rows], data.truncated[rows], np.zeros(len(rows), bool),
             self.elapsed[rows], _DataInfo(data, rows, skill),
         )  # fmt: skip
-        goal = self.goal[i][start] if i in self.goal else None
         return part_of(whole, elapsed, None, skill.max_steps, goal)
 
     def check_infos(self) -> None:
