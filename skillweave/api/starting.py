@@ -140,7 +140,8 @@ def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: Manifes
             f"{short(role.action_space, 200)} have"
         )
     policy = AgentPolicy(algorithm, fresh | weights)
-    return Learnt(policy, origin.sha256(), origin.steps, origin.name, None, ((), ()))
+    of = policy, origin.sha256(), origin.steps, origin.name, None, ((), ())
+    return Learnt(*of, critic="critic" in origin.networks)
 
 
 def _config_in(stage: StageEntry, name: str) -> Any:

@@ -66,7 +66,8 @@ def begin(
         made: Clone = clone(config, obs, action, group, roles[name].spaces, seeds, mask)
         sha256 = made.policy.source()["sha256"]
         chooses = options_of(content, name)
-        learnt[name] = Learnt(made.policy, sha256, made.rows, episodes.name, None, chooses)
+        of = made.policy, sha256, made.rows, episodes.name, None, chooses
+        learnt[name] = Learnt(*of, critic=False)
         notes.append(f"{name} is cloned: {made}")
     if not learnt:
         raise DeclarationError(f"nothing can be cloned from {episodes.name}: {'; '.join(notes)}")

@@ -286,7 +286,8 @@ def start_of(
     selector = imitate(config, seen, may, chances, spec.spaces.observation, seeds, with_goals)
     names = tuple(skill.name for skill in policy.skills.skills)
     sha256 = selector.source()["sha256"]
-    return {SELECTOR: Learnt(selector, sha256, log.steps, "the plan", None, (names, log.lengths))}
+    of = selector, sha256, log.steps, "the plan", None, (names, log.lengths)
+    return {SELECTOR: Learnt(*of, critic=False)}
 
 
 def mission_words(declared: Declaration, given: Mapping[str, Any]) -> dict[str, Any]:

@@ -48,6 +48,8 @@ class Learnt:
     """The entry of a skill of a run; else None."""
     code: dict[str, str] = field(default_factory=dict)
     """The other run's texts of its environment and skills."""
+    critic: bool = True
+    """Its critic was learnt with it."""
 
 
 Chooses = tuple[tuple[str, ...], tuple[int, ...]]
@@ -116,7 +118,8 @@ def record_initial_policies(
             )
         if names:
             entry.starts = {
-                name: Start((of := learnt[name]).sha256, of.steps, of.run) for name in names
+                name: Start((of := learnt[name]).sha256, of.steps, of.run, of.critic)
+                for name in names
             }
     if not started:
         learners = sorted({name for entry in stages for name in entry.learns})

@@ -218,6 +218,8 @@ class Start:
     """Environment steps of its training there."""
     run: str | None
     """The other run's ``id``."""
+    critic: bool = True
+    """Its critic was learnt with it."""
     copy: str | None = None
     """Checksum of this run's copy; None: it is not written yet."""
 

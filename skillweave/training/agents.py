@@ -46,6 +46,10 @@ from skillweave.training.stage_log import StageLog, resumed, success_rate
 from skillweave.training.stage_run import StageRun
 from skillweave.workers.placement import MakeCollectors, make_collectors
 
+CRITIC_FIRST, SHARE = 5, 0.1
+"""Updates in which a critic learns alone, where the policy was learnt without it, and the most of a
+stage's budget that they take: by the advantages of a critic that has learnt nothing the first
+updates would undo the policy."""
 EARLY = 0.25
 """Share of a stage's budget after which skills without a call are reported."""
 
@@ -209,6 +213,10 @@ class Agents:
             first = name == self.entry.decides
             keep_to_guide(learner, self.entry.guide_kl if first else self.roles[name].guide_kl)
             rehearse(learner, self.log.run, self.entry, self.stage.policies.get(name))
+            start = self.entry.starts.get(name)
+            if start is not None and not start.critic and not tensors:
+                each = int(algorithm.config.n_steps) * self.entry.num_envs
+                learner.critic_first = min(CRITIC_FIRST, int(SHARE * self.entry.budget) // each)
         elif self.earlier[name] is not None or name in self.entry.starts:
             learner.act_from_the_start()
         return learner

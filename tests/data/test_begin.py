@@ -119,6 +119,46 @@ def test_a_plain_agent_begins_so_too_and_a_run_resumes_without_the_data(
     assert np.mean(again.evaluate(40).returns) > 0.6
 
 
+def weights_of(run: Any) -> dict[str, Array]:
+    return {name: x.numpy() for name, x in run.policy.weights.items()}
+
+
+def test_at_first_the_critic_learns_alone_and_a_stopped_run_goes_on_so(
+    data: sw.Dataset, tmp_path: Path
+) -> None:
+    """A tenth of 3,840 steps are three updates: then the actor learns, too."""
+    ppo = sw.PPO(num_envs=4, n_steps=32, normalize_obs=False)
+    how: Any = {"steps": 3_840, "data": data, "quiet": True, "checkpoint_every": 128}
+
+    def until(updates: int, raises: bool = False) -> Any:
+        seen: list[Any] = []
+
+        def stop(event: Any) -> bool:
+            seen.append(event)
+            if raises and len(seen) == updates:
+                raise KeyboardInterrupt
+            return raises or len(seen) < updates
+
+        return stop
+
+    after = [
+        weights_of(sw.train_agent(spec(), ppo, run_dir=tmp_path / str(k), callback=until(k), **how))
+        for k in (1, 4, 14)
+    ]
+    actor = [name for name in after[0] if name.startswith("actor.")]
+    critic = [name for name in after[0] if name.startswith("critic.")]
+    assert all((after[0][name] == after[1][name]).all() for name in actor)
+    assert any((after[0][name] != after[1][name]).any() for name in critic)
+    assert any((after[1][name] != after[2][name]).any() for name in actor)
+    whole = sw.train_agent(spec(), ppo, run_dir=tmp_path / "whole", **how)
+    place = tmp_path / "stopped"
+    with pytest.raises(KeyboardInterrupt):
+        sw.train_agent(spec(), ppo, run_dir=place, callback=until(3, raises=True), **how)
+    again = sw.train_agent(spec(), ppo, run_dir=place, resume=True, **how)
+    for name, value in weights_of(whole).items():
+        np.testing.assert_array_equal(weights_of(again)[name], value)
+
+
 def test_what_cannot_be_cloned_is_said(data: sw.Dataset, tmp_path: Path, capsys: Any) -> None:
     hierarchy(
         algorithm=sw.DQN(num_envs=4, learning_starts=16),

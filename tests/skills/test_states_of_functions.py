@@ -6,6 +6,7 @@ import random
 import sys
 from collections.abc import Callable
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -15,6 +16,8 @@ from gymnasium.spaces import Box, Discrete
 from skillweave import tree
 from skillweave._internal.notices import collected_notices
 from skillweave.calls import Predicate
+from skillweave.data.dataset import Dataset
+from skillweave.data.segmenting import _Cuts
 from skillweave.errors import DeclarationError, PolicyError, SkillError
 from skillweave.experience.judges import SkillJudge
 from skillweave.planning import GoalTask, RewardMachine
@@ -236,6 +239,19 @@ def achieves():
     return lambda: judge.achieved(OBS)
 
 
+def cuts():
+    """Goals of calls in data, by a function of the user."""
+    episode = {"observations": np.ones((5, 1), np.float32), "actions": np.zeros(4, int)}
+    spaces = {"observation_space": SPACES[0], "action_space": SPACES[1]}
+    found = cast(Any, object.__new__(_Cuts))
+    found.data = Dataset([episode], **spaces)
+    found.skills = SimpleNamespace(skills=[SimpleNamespace(name="a")])
+    found.given = [OfObservations()]
+    declared = {"goal_space": Box(0, 9, (1,))}
+    goals = Goals(type("Kind", (Goal, Skill), declared)())
+    return lambda: found._goals(0, goals)
+
+
 def places() -> dict[str, list[Callable[[], Any]]]:
     """Return uses of functions of the user, by the modules that call them."""
     never = Predicate(lambda obs: obs[:, 0] > 9)
@@ -264,6 +280,7 @@ def places() -> dict[str, list[Callable[[], Any]]]:
             lambda: reflex.override(actions).apply(OBS, actions.start(4), actions),
             *map(method, Skill.methods),
         ],
+        "data.segmenting": [cuts()],
         "skills.foreign_policy": [lambda: check_spaces(own, *SPACES, "it", "env")],
         "skills.goals": [method("goals"), method("clip_goal")],
         "skills.scripted": [acts(), acts(sees={"about": slice(0, 1)}), reads(Best())],
