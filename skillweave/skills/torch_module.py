@@ -332,7 +332,8 @@ def from_torch(
 
     With ``learn=True`` the skill is trained by ``PPO``, and begins with the module, a
     ``Sequential`` of linear layers with one kind of nonlinearity between them; the critic and the
-    deviation of actions start afresh.
+    deviation of actions start afresh, so the critic learns alone in the first five updates, at most
+    a tenth of the steps.
 
     Args:
         module: acts in evaluation mode, as a copy made when training starts; or a file of
