@@ -21,6 +21,7 @@ from skillweave.policies.core import Array
 from skillweave.runs.initial_policies import Learnt, options_of
 from skillweave.runs.manifest import Manifest
 from skillweave.skills.goals import goals_of
+from skillweave.skills.learnable import Learnable
 from skillweave.spaces import action_codec
 from skillweave.training.role import Role
 
@@ -58,7 +59,7 @@ def begin(
             count = 0 if rows is None else len(rows[0])
             why = f"{count} rows of it are in the data, fewer than {FEWEST}"
         if why:
-            notes.append(f"{name} starts with nothing: {why}")
+            notes.append(f"{name} is not cloned: {why}")
             continue
         assert rows is not None
         seeds = Seeds(content.seed) / name / "clone"
@@ -92,6 +93,8 @@ def _why_not(config: Any, role: Role) -> str:
         return f"{type(config).__name__} has no network whose actions can be cloned"
     if make_algorithm(config, *role.spaces).memory_size:
         return "its network has a memory"
+    if role.skill is not None and isinstance(role.skill.policy, Learnable):
+        return "it learns on from its own policy"
     if "/" in role.path:
         return "it is in a hierarchy that is a skill"
     if role.skill is not None and role.part is not None and role.part.base is not None:

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 import skillweave as sw
 from skillweave._internal.seeding import Seeds
@@ -159,13 +160,32 @@ def test_at_first_the_critic_learns_alone_and_a_stopped_run_goes_on_so(
         np.testing.assert_array_equal(weights_of(again)[name], value)
 
 
+def test_a_skill_that_learns_on_from_its_own_policy_keeps_it(
+    data: sw.Dataset, tmp_path: Path, capsys: Any
+) -> None:
+    module = torch.nn.Sequential(torch.nn.Linear(2, 8), torch.nn.Tanh(), torch.nn.Linear(8, 3))
+
+    class Own(Reach):
+        name = "reach"
+        policy = sw.from_torch(module, learn=True)
+
+    ppo = sw.PPO(num_envs=4, n_steps=32)
+    made = sw.Hierarchy(
+        spec(), [Own(), Grip(), Raise()], algorithm=ppo, selector=ppo, steps=256, call_steps=40
+    )
+    made.train(tmp_path, data=data)
+    said = capsys.readouterr().err
+    assert "reach is not cloned: it learns on from its own policy" in said
+    assert "raise is cloned" in said
+
+
 def test_what_cannot_be_cloned_is_said(data: sw.Dataset, tmp_path: Path, capsys: Any) -> None:
     hierarchy(
         algorithm=sw.DQN(num_envs=4, learning_starts=16),
         selector=sw.PPO(num_envs=4, n_steps=32), learn="apart",
     ).train(tmp_path / "a", data=data)  # fmt: skip
     said = capsys.readouterr().err
-    assert "reach starts with nothing: DQN has no network whose actions can be cloned" in said
+    assert "reach is not cloned: DQN has no network whose actions can be cloned" in said
     assert "selector is cloned" in said
     with pytest.raises(DeclarationError, match=r"nothing can be cloned from .*DQN has no network"):
         sw.train_agent(spec(), sw.DQN(), steps=5_000, run_dir=tmp_path / "b", data=data, quiet=True)
