@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Dict, Tuple
 
 from skillweave._internal.messages import short
 from skillweave._internal.paths import AGENT
@@ -91,6 +92,8 @@ def _why_not(config: Any, role: Role) -> str:
         return "it is a critic"
     if not isinstance(config, PPO):
         return f"{type(config).__name__} has no network whose actions can be cloned"
+    if config.squash_actions and isinstance(role.action_space, Dict | Tuple):
+        return "squash_actions of actions with several parts"
     if make_algorithm(config, *role.spaces).memory_size:
         return "its network has a memory"
     if role.skill is not None and isinstance(role.skill.policy, Learnable):

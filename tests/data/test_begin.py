@@ -221,6 +221,9 @@ def test_a_clone_is_judged_by_rows_that_it_has_not_seen(numbers: bool, few: bool
     given, _ = policy.act(policy.start(800), obs)
     if numbers:
         assert np.abs(given - action).mean() < 0.05
+        squashed = clone(sw.PPO(squash_actions=True), obs, action, group, (space, acts), Seeds(0))
+        given, _ = squashed.policy.act(squashed.policy.start(800), obs)
+        assert np.abs(given - action).mean() < 0.05
         fresh = clone(sw.PPO(), obs[:30], action[:30], group[:30], (space, acts), Seeds(0))
         name = "actor.log_std"
         assert policy.weights[name].tolist() == fresh.policy.weights[name].tolist()
