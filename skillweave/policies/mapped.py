@@ -1167,10 +1167,12 @@ class Mapped(RowPolicy):
             goal = None if self._goal_shape is None else self._aim(obs, turn)
             last = memory["last"][rows] if self._last else None
             call = self._call(memory, rows) if self._timed else None
-            numbers = {name: one.now(obs, goal, last, call) for name, one in self.inputs.items()}
+            inputs = {name: one.now(obs, goal, last, call) for name, one in self.inputs.items()}
             if self._pasts:
-                self._with_past(memory, rows, numbers)
-            inputs = {name: one.shaped(numbers[name]) for name, one in self.inputs.items()}
+                self._with_past(memory, rows, inputs)
+            for name, one in self.inputs.items():
+                if one.reshaped or one.last_scaling is not None:
+                    inputs[name] = one.shaped(inputs[name])
         before = tuple(memory[key][rows] for key, _, _ in self._states)
         return self.model.call(inputs, before, turn)
 
