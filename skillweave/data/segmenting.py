@@ -224,8 +224,7 @@ class _Cuts:
         )
         limits = [skills.limit(i) for i in range(count)]
         self.limits = np.array([data.steps if limit is None else limit for limit in limits])
-        ends = np.repeat(data.offset[1:], data.lengths)
-        self.over = ends
+        self.over = np.repeat(data.offset[1:], data.lengths)
         """(T,) the first step after the episode of each."""
         self.whole = np.repeat(data.whole, data.lengths)
         """(T,) bool, the last observation of its episode is known."""
@@ -353,10 +352,9 @@ class _Cuts:
         while len(waits):
             width = max(1, min(size, ROWS // len(waits)))
             counts = np.minimum(width, final[waits] - begin[waits] + 1)
-            rows = np.repeat(begin[waits] - np.cumsum(counts) + counts, counts) + np.arange(
-                counts.sum()
-            )
             of = np.repeat(np.arange(len(waits)), counts)
+            before = np.cumsum(counts) - counts
+            rows = (begin[waits] - before)[of] + np.arange(len(of))
             first = starts[waits][of]
             stops = call_method(skill, "termination", self._step(i, rows, rows - first + 1, first))
             # An episode's last observation may not be known: nothing ends by itself there.
@@ -386,9 +384,7 @@ class _Cuts:
 
     def _known(self, rows: Array) -> Array:
         """Return of which steps the next observation is known, (k,) bool."""
-        known: Array = (rows < self.over[rows] - 1) | np.repeat(self.data.whole, self.data.lengths)[
-            rows
-        ]
+        known: Array = (rows < self.over[rows] - 1) | self.whole[rows]
         return known
 
     def _long_enough(self, last: Array, starts: Array) -> Array:
@@ -403,8 +399,6 @@ class _Cuts:
         lead = (data.steps, 1)
         runs = self.skill >= 0
         call_elapsed = np.where(runs, np.arange(data.steps) - self.since + 1, 0)
-        ends_episode = np.zeros(data.steps, bool)
-        ends_episode[data.offset[1:] - 1] = True
         columns: dict[str, Array] = {
             "obs": data.obs,
             "next_obs": data.next_obs,
