@@ -12,7 +12,7 @@ from skillweave.data.dataset import Dataset
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
 from skillweave.experience.play import PlayedStep
-from skillweave.schema import fitted
+from skillweave.schema import AtLeastOne, fitted
 from skillweave.training.evaluation import evaluate
 
 
@@ -53,6 +53,7 @@ def record(
         PolicyError: the policy does not fit the environment.
         EnvError: the environment cannot be made, or sets no such key of ``info``.
     """
+    episodes = fitted(AtLeastOne, episodes, "record(): episodes")
     fitted(Sequence[str], info, "record(): info")
     spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
     rows: list[list[tuple[Any, ...]]] = [[] for _ in range(episodes)]

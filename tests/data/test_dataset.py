@@ -110,6 +110,12 @@ def test_recorded_episodes_are_those_that_evaluate_plays() -> None:
         sw.record(lean, "CartPole-v1", episodes=1, info=["x"])
 
 
+@pytest.mark.parametrize("episodes", ["5", 2.5, 0])
+def test_a_wrong_number_of_episodes_is_named(episodes: object) -> None:
+    with pytest.raises(DeclarationError, match="episodes"):
+        sw.record(lean, "CartPole-v1", episodes=episodes)  # type: ignore[arg-type]
+
+
 def test_a_log_of_calls_is_a_set_of_the_same_steps(tmp_path: Path) -> None:
     class Lean(sw.Skill):
         policy = sw.from_function(lean)
