@@ -199,9 +199,9 @@ class Agent(Trainable, PlainAgent):
             eval_episodes: episodes of each of these evaluations, by default 20.
             checkpoint_every: environment steps between checkpoints, by default 100,000.
             keep: "best": each stage ends with the weights whose periodic evaluation was best, by
-                the mean return or by what its target is of; the last weights are evaluated, too.
-                It needs ``eval_every``. A population ends with its best member in any case. By
-                default "last".
+                the mean return or by what its target is of; the last weights are evaluated, too,
+                and policies that were given. It needs ``eval_every``. A population ends with its
+                best member in any case. By default "last".
             log_info: keys of ``info``: the mean of each over the latest 100 episodes is
                 ``info/<key>`` in ``metrics.jsonl`` and in trackers. Each episode counts with the
                 value in its last step (in a skill's own stage, its call's). None, NaN and
@@ -409,9 +409,9 @@ class Hierarchy(Trainable, Declaration):
             eval_episodes: episodes of each of these evaluations, by default 20.
             checkpoint_every: environment steps between checkpoints, by default 100,000.
             keep: "best": each stage ends with the weights whose periodic evaluation was best, by
-                the mean return or by what its target is of; the last weights are evaluated, too.
-                It needs ``eval_every``. A population ends with its best member in any case. By
-                default "last".
+                the mean return or by what its target is of; the last weights are evaluated, too,
+                and policies that were given. It needs ``eval_every``. A population ends with its
+                best member in any case. By default "last".
             log_info: keys of ``info``: the mean of each over the latest 100 episodes is
                 ``info/<key>`` in ``metrics.jsonl`` and in trackers. Each episode counts with the
                 value in its last step (in a skill's own stage, its call's). None, NaN and
@@ -1273,9 +1273,9 @@ def train_agent(
         eval_episodes: episodes of each of these evaluations, by default 20.
         checkpoint_every: environment steps between checkpoints, by default 100,000.
         keep: "best": each stage ends with the weights whose periodic evaluation was best, by
-            the mean return or by what its target is of; the last weights are evaluated, too.
-            It needs ``eval_every``. A population ends with its best member in any case. By
-            default "last".
+            the mean return or by what its target is of; the last weights are evaluated, too,
+            and policies that were given. It needs ``eval_every``. A population ends with its
+            best member in any case. By default "last".
         log_info: keys of ``info``: the mean of each over the latest 100 episodes is
             ``info/<key>`` in ``metrics.jsonl`` and in trackers. Each episode counts with the
             value in its last step (in a skill's own stage, its call's). None, NaN and

@@ -332,6 +332,7 @@ class Agents:
         log = self.log
         steps = self.loop.at.steps
         made = self.collectors.steps_made
+        self._evaluate_start()
         self.loop.run()
         if self.loop.ended:
             # Count the steps collected since the update, too.
@@ -355,6 +356,17 @@ class Agents:
             log.kept_best(best, self.best.of)
         self._report_little_learnt()
         return self.policies()
+
+    def _evaluate_start(self) -> None:
+        """Evaluate initial policies that were learnt elsewhere: the best weights may be theirs."""
+        log, best = self.log, self.best
+        if not best.wanted or not self.entry.starts or log.at.steps or self.entry.continued:
+            return
+        evaluation = self.evaluation.due(0, 0, self.play, also=True)
+        log.at.evaluation_steps += self.evaluation.spent()
+        best.see(evaluation, 0, self.states)
+        log.at.kept_best = best.found
+        log.tick(0, 0, log.at.seconds, evaluation)
 
     def _on_tick(self, tick: Tick) -> None:
         """Evaluate where it is due, and write a report; end at the target, or for a callback."""

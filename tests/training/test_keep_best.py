@@ -276,3 +276,29 @@ def test_a_recipe_may_say_what_is_kept(tmp_path):
     assert last.info()["keep"] == "last"
     assert last.info()["log_info"] == []
     assert "best" not in last.info()["stages"][0]
+
+
+def test_the_start_from_another_run_is_the_first_evaluation(tmp_path):
+    good = agent(9_600, replace(ON, num_envs=8)).train(tmp_path / "good", quiet=True)
+    wild = replace(ON, learning_rate=1.0)
+    how = {"start_from": good, **BEST, "eval_episodes": 10}
+    run = agent(320, wild).train(tmp_path / "run", **how)
+    (stage,) = run.info()["stages"]
+    assert stage["best"]["steps"] == 0
+    (kept,), (first,) = policies(run.path).values(), policies(good.path).values()
+    assert kept[1] == first[1]
+    found = evaluations(run.path, "agent")
+    assert stage["best"]["value"] == found[0] == max(found.values())
+    new = agent(320, wild).train(tmp_path / "new", **BEST)
+    assert 0 not in evaluations(new.path, "agent")
+
+
+def test_a_run_that_began_elsewhere_repeats_its_best_after_an_interrupt(tmp_path):
+    good = agent(3_200, ON).train(tmp_path / "good", quiet=True)
+    wild = replace(ON, learning_rate=1.0)
+    whole = agent(640, wild).train(tmp_path / "whole", start_from=good, **BEST)
+    with interrupted(1):
+        agent(640, wild).train(tmp_path / "parts", start_from=good, **BEST)
+    parts = agent(640, wild).train(tmp_path / "parts", start_from=good, resume=True, **BEST)
+    assert_same(parts.path, whole.path)
+    assert evaluations(parts.path, "agent") == evaluations(whole.path, "agent")
