@@ -17,7 +17,9 @@ if TYPE_CHECKING:
         workers as workers,
     )
     from skillweave.algorithms.config import (
+        CQL as CQL,
         DQN as DQN,
+        IQL as IQL,
         PPO as PPO,
         SAC as SAC,
         TD3 as TD3,

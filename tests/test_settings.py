@@ -114,7 +114,8 @@ BY_RULE: dict[tuple[Any, str], tuple[Any, ...]] = {
 }
 """Wrong values of fields whose rule is a function, or stands beside the annotation."""
 UNBOUNDED = {
-    *((sw.DQN, "v_min"), (sw.DQN, "v_max"), (Range, "low"), (Range, "high")),
+    *((sw.DQN, "v_min"), (sw.DQN, "v_max"), (sw.CQL, "v_min"), (sw.CQL, "v_max")),
+    *((Range, "low"), (Range, "high")),
     *((sw.SAC, "target_entropy"), (Evolution, "target")),
     *((sw.Selection, "target_return"), (sw.Agent, "target_return"), (sw.Table, "start")),
 }
@@ -122,6 +123,8 @@ UNBOUNDED = {
 BESIDE: dict[tuple[type[Any], str], dict[str, Any]] = {
     (sw.DQN, "v_min"): {"v_max": 9.0},
     (sw.DQN, "v_max"): {"v_min": -9.0},
+    (sw.CQL, "v_min"): {"v_max": 9.0},
+    (sw.CQL, "v_max"): {"v_min": -9.0},
     (sw.Hierarchy, "selector"): {"learn": "apart"},
     (sw.Elapsed, "wave"): {"period": 4.0},
 }
@@ -228,10 +231,10 @@ def test_every_number_has_bounds_but_those_that_may_be_any():
 
 RANGES: dict[Any, str] = {
     Fraction: (
-        "action_repeat activation architecture epsilon epsilon_final epsilon_fraction "
+        "action_repeat activation architecture epsilon epsilon_final epsilon_fraction expectile "
         "exploration_final_eps exploration_fraction exploration_initial_eps gae_lambda gamma "
-        "hyperparameters layer_share none parameters priority_alpha priority_beta quota share "
-        "shared_replay step tau"
+        "hyperparameters layer_share none online parameters priority_alpha priority_beta quota "
+        "share shared_replay step tau"
     ),
     Share: ("target_success"),
     Positive: (
@@ -239,9 +242,9 @@ RANGES: dict[Any, str] = {
         "period rate reference_kl target_kl update_ratio"
     ),
     NonNegative: (
-        "action_l2 deliberation_cost end ent_coef ent_coef_final exploration_noise imitation_coef "
-        "imitation_vf_coef margin min_advantage_std patience start strength target_noise "
-        "target_noise_clip task_weight vf_coef"
+        "action_l2 beta cql_alpha deliberation_cost end ent_coef ent_coef_final exploration_noise "
+        "imitation_coef imitation_vf_coef margin min_advantage_std patience start strength "
+        "target_noise target_noise_clip task_weight vf_coef"
     ),
     AtLeastOne: (
         "batch_size checkpoint_every collectors episode_calls episodes eval_episodes "

@@ -8,7 +8,7 @@ from typing import Any
 
 PUBLIC = {
     "skillweave": {
-        "algorithms.config": "DQN PPO SAC TD3",
+        "algorithms.config": "CQL DQN IQL PPO SAC TD3",
         "api": "Agent Hierarchy Run train_agent",
         "api.loading": "from_hub load",
         "api.player": "Player",

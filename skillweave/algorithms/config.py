@@ -310,8 +310,9 @@ class OffPolicy:
     """Learn also from goals that were reached instead (HER): True, or ``Hindsight(...)``. For
     skills with goals that define ``achieved_goal``, and agents in environments of goals."""
     shared_replay: Fraction = 0.0
-    """Share of the samples that other skills of the hierarchy have made (SAC-X, Riedmiller et al.
-    2018), each judged by the skill's own reward and ends; 0: a skill learns from its own steps."""
+    """Share of the samples that the learner did not make itself: steps of other skills of the
+    hierarchy (SAC-X, Riedmiller et al. 2018), and those of ``data`` (RLPD, Ball et al. 2023). A
+    skill judges each by its own reward and ends. 0: it learns from its own steps."""
     threads: Threads = 1
     """Torch threads while learning."""
     compile: bool | Literal["auto"] = False
@@ -341,6 +342,11 @@ class OffPolicy:
         if judges_again := next((x for x in JUDGES_AGAIN if getattr(self, x)), None):
             check(self, "n_step", self.n_step == 1, f"1 where {judges_again} is set")
             check(self, "prioritized", not self.prioritized, f"False where {judges_again} is set")
+        elif is_offline(self):
+            check(self, "n_step", self.n_step == 1, "1 where it learns from data alone")
+            check(
+                self, "prioritized", not self.prioritized, "False where it learns from data alone"
+            )
 
 
 @settings
@@ -411,8 +417,34 @@ class DQN(OffPolicy):
 
 
 @settings
+class CQL(DQN):
+    """Conservative Q-learning of discrete actions (Kumar et al. 2020), from recorded steps.
+
+    DQN with a cost for values of actions that the data do not show. It learns from ``data`` alone,
+    so no environment is stepped, and the steps of its budget are gradient steps.
+
+    Raises:
+        DeclarationError: a setting is wrong or out of its range; the message names it.
+    """
+
+    online: Fraction = 0.0
+    """Share of the budget, at its end, that are steps in the environment: it learns on from them
+    and from the data."""
+    shared_replay: Fraction = 0.5
+    """Share of the samples that are from data, once it steps the environment."""
+    cql_alpha: NonNegative = 1.0
+    """Weight of the cost, in units of the rewards that it learns; 0: DQN."""
+    normalize_rewards: bool = True
+    """Rewards are divided by the running deviation of returns."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_data_share(self)
+
+
+@settings
 class ActorCritic(OffPolicy):
-    """Settings that TD3 and SAC share, with defaults that differ from DQN's."""
+    """Settings that TD3, SAC and IQL share, with defaults that differ from DQN's."""
 
     update_ratio: Positive = 0.5
     """Gradient steps per transition collected (the update-to-data ratio)."""
@@ -490,6 +522,50 @@ class SAC(ActorCritic):
     """Critic updates for each update of the actor."""
 
 
+@settings
+class IQL(ActorCritic):
+    """Implicit Q-learning (Kostrikov et al. 2022), from recorded steps.
+
+    The critics never judge an action that the data do not show, and the policy imitates actions
+    the more, the better they are than the state's value. It learns from ``data`` alone, so no
+    environment is stepped, and the steps of its budget are gradient steps.
+
+    Raises:
+        DeclarationError: a setting is wrong or out of its range; the message names it.
+    """
+
+    online: Fraction = 0.0
+    """Share of the budget, at its end, that are steps in the environment: it learns on from them
+    and from the data."""
+    shared_replay: Fraction = 0.5
+    """Share of the samples that are from data, once it steps the environment."""
+    expectile: Fraction = 0.7
+    """The expectile of action values that a state's value is: 0.5 their mean under the data, near 1
+    the best one that the data show."""
+    beta: NonNegative = 3.0
+    """How much more better actions are imitated: by exp(beta · advantage); 0: cloning."""
+    normalize_rewards: bool = True
+    """Rewards are divided by the running deviation of returns, so that ``beta`` has one unit."""
+    action_repeat: Fraction = 0.0
+    """See ``OffPolicy``."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, "expectile", 0.0 < self.expectile < 1.0, "between 0 and 1")
+        _check_data_share(self)
+
+
+def _check_data_share(config: IQL | CQL) -> None:
+    """Check that an algorithm that learns from data can draw from them."""
+    draws = config.shared_replay > 0.0 or config.online == 1.0
+    check(config, "shared_replay", draws, "above 0, unless online is 1")
+
+
+def is_offline(config: Any) -> bool:
+    """Return whether settings let a learner learn from data alone, at first."""
+    return bool(getattr(config, "online", 1.0) < 1.0)
+
+
 AlgorithmConfig: TypeAlias = OnPolicy | OffPolicy
 """Any algorithm's settings, those of users' own algorithms included."""
 AlgorithmSettings: TypeAlias = Annotated[
@@ -529,10 +605,12 @@ _REGISTERED: dict[str, Registration] = {
     "DQN": Registration(
         DQN, f"{_HOME}.dqn:DQNAlgorithm", (_SPACES.Discrete,), chooses_goals="discrete"
     ),
+    "CQL": Registration(CQL, f"{_HOME}.cql:CQLAlgorithm", (_SPACES.Discrete,)),
     "TD3": Registration(TD3, f"{_HOME}.td3:TD3Algorithm", (_SPACES.Box,)),
     "SAC": Registration(
         SAC, f"{_HOME}.sac:SACAlgorithm", (_SPACES.Box, _SPACES.Discrete), chooses_goals="discrete"
     ),
+    "IQL": Registration(IQL, f"{_HOME}.iql:IQLAlgorithm", (_SPACES.Box, _SPACES.Discrete)),
 }
 BUILT_IN = tuple(_REGISTERED)
 """Names of the algorithms of this library."""
@@ -690,7 +768,9 @@ def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConf
 
 
 __all__ = [
+    "CQL",
     "DQN",
+    "IQL",
     "PPO",
     "SAC",
     "TD3",

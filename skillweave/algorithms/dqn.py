@@ -165,8 +165,8 @@ class DQNAlgorithm(OffPolicyAlgorithm):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Compute loss (P,), each sample's error (P, B), mean value (P,); the last two detached."""
         params = ActingParams({}, *self.scaling(state))
-        out = self.net(self._noisy(views, noises[0]), self.inputs(params, sample.obs))
-        out = _of_action(out, sample.action)
+        every = self.net(self._noisy(views, noises[0]), self.inputs(params, sample.obs))
+        out = _of_action(every, sample.action)
         next_inputs = self.inputs(params, sample.next_obs)
         reward = self.rewards(state, sample)
         with torch.no_grad():
@@ -180,7 +180,13 @@ class DQNAlgorithm(OffPolicyAlgorithm):
             each = -(target * log_p).sum(-1)
             value = (log_p.detach().exp() * self.atoms.on(log_p.device)).sum(-1)
             error = each.detach()
-        return weighted_mean(each, sample.weight), error, value.detach().mean(1)
+        loss = weighted_mean(each, sample.weight)
+        cost = self.cost(every, sample)
+        return loss if cost is None else loss + cost, error, value.detach().mean(1)
+
+    def cost(self, out: Tensor, sample: Sample) -> Tensor | None:
+        """Return a further cost of outputs (P, B, A, atoms), (P,); None: there is none."""
+        return None
 
     def _target(
         self,

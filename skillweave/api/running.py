@@ -20,6 +20,7 @@ from skillweave.api.applying import D, Trained, apply_manifest, differences
 from skillweave.api.continuing import continuable_run, continue_run
 from skillweave.api.starting import starts
 from skillweave.api.train_options import TrainOptions
+from skillweave.buffers.recorded_steps import RecordedSteps
 from skillweave.calls.recorder import check_size
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, Interrupted, RunError
@@ -33,14 +34,21 @@ from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import called_by, resume_words, saved_words
 from skillweave.runs.directory import First, RunDirectory
 from skillweave.runs.hub import must_be_own
-from skillweave.runs.initial_policies import copy_initial_policies
+from skillweave.runs.initial_policies import Learnt, copy_initial_policies
 from skillweave.runs.manifest import Manifest, identity
 from skillweave.runs.numbered import make_numbered
 from skillweave.runs.trackers import Listener, make_trackers
 from skillweave.training.callback import TrainCallback
 from skillweave.training.plain_agent import Declared
 from skillweave.training.role import Role, agent_role
-from skillweave.training.stage import assign_workers, check_replay, check_stages, workers_of
+from skillweave.training.stage import (
+    assign_workers,
+    check_data,
+    check_replay,
+    check_room,
+    check_stages,
+    workers_of,
+)
 from skillweave.workers.cluster import Ray
 from skillweave.workers.placement import LOCAL, Placement
 from skillweave.workers.start_methods import runs_again, why_no_processes
@@ -113,17 +121,24 @@ def start_run(
         start_from = options.start_from
         if start_from is None and content.hierarchy is not None and declared._starts is not None:
             start_from = declared._starts()
+        check_data(content.stages, roles, given=options.data is not None)
+        recorded: RecordedSteps | None = None
         if options.data is not None:
-            cloned, says = fetch("begin")(declared, content, roles, options.data)
-            if start_from is not None and not isinstance(start_from, Mapping):
+            cloned, recorded, says = fetch("begin")(declared, content, roles, options.data)
+            named = start_from if isinstance(start_from, Mapping) else {}
+            if cloned and start_from is not None and named is not start_from:
                 raise DeclarationError(
                     "data and start_from are given: name the learners that start from a run, "
                     'start_from={"open": run}; the others begin from the data'
                 )
-            start_from = {**cloned, **(start_from or {})}
+            if cloned:
+                start_from = {**cloned, **named}
             note = "; ".join(filter(None, (note, says)))
+        if recorded is not None:
+            content = replace(content, data=recorded.name)
+            check_room(content.stages, recorded.slots)
         learnt, origin = starts(content, start_from, roles) if repair is None else ({}, "")
-        first = repair or partial(copy_initial_policies, learnt=learnt)
+        first = repair or partial(_first_files, learnt=learnt, recorded=recorded)
         note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))
         make_trackers(options.track, None)  # a missing extra is reported before anything is written
         if options.cluster is not None:
@@ -136,6 +151,15 @@ def start_run(
         run = RunDirectory.create(place, content, first, hold=True, overwrite=options.overwrite)
         stack.callback(run.close)
         return train_stages(declared, run, options, note, done)
+
+
+def _first_files(
+    run: RunDirectory, learnt: Mapping[str, Learnt], recorded: RecordedSteps | None
+) -> None:
+    """Write the files that a new run begins with: initial policies, and recorded steps."""
+    copy_initial_policies(run, learnt)
+    if recorded is not None:
+        run.save_data(recorded.tensors())
 
 
 def _kept_by_populations(content: Manifest) -> str:

@@ -257,6 +257,76 @@ class JudgedStore(ReplayStore):
             self.add(batch)
             yield batch
 
+    def add_recorded(self, rows: Batch, rng: np.random.Generator) -> Batch:
+        """Add rows that were recorded elsewhere; return them as the learner judges them.
+
+        Args:
+            rows: raw columns; ``valid`` where there is a step, ``call_end`` where an episode ends.
+            rng: draws the goals that a skill practises there.
+
+        Raises:
+            SkillweaveError: the learner cannot judge them.
+        """
+        lead = rows["valid"].shape
+        env_action = rows["env_action"].reshape(-1, *rows["env_action"].shape[2:])
+        action, possible = self._judge.action(env_action)
+        valid = rows["valid"] & possible.reshape(lead)
+        terminated = valid & rows["env_terminated"]
+        over = rows["call_end"] != 0
+        over[:-1] |= ~valid[1:]
+        over[-1] = True
+        added = rows.replace(
+            action=action.reshape(*lead, *action.shape[1:]),
+            reward=np.zeros(lead, np.float32),
+            steps=np.ones(lead, np.int64),
+            terminated=terminated,
+            truncated=valid & over & ~terminated,
+            valid=valid,
+            own=np.zeros(lead, bool),
+        )
+        goal, reward, ends = self._judged_at_once(added, rng)
+        if goal is not None and "goal" in self._judge.examples:
+            added = added.replace(goal=goal)
+        self.add(added)
+        return added.replace(
+            obs=self._judge.seen(rows["obs"], goal),
+            own=None,
+            reward=reward,
+            terminated=valid & ends,
+            truncated=added["truncated"] & ~ends,
+        )
+
+    def _judged_at_once(
+        self, rows: Batch, rng: np.random.Generator
+    ) -> tuple[Array | None, Array, Array]:
+        """Return goals to practise, rewards and ends of all rows (T, N), a piece at a time."""
+        count, _ = rows["valid"].shape
+        most = max(1, PIECE // max(1, rows["obs"][0].nbytes))
+        goals, rewards, ends = list[Any](), list[Array](), list[Array]()
+        for begin in range(0, count, most):
+            part = {name: x[begin : begin + most] for name, x in rows.items()}
+            lead = part["valid"].shape
+
+            def flat(x: Array) -> Array:
+                return x.reshape(-1, *x.shape[2:])
+
+            columns = {name: flat(x) for name, x in part.items()}
+            columns |= {
+                name: np.repeat(example, len(columns["valid"]), axis=0)
+                for name, example in self._judge.examples.items()
+                if name not in columns
+            }
+            raw = RawRows(columns["obs"], columns["next_obs"], columns)
+            goal = self._judge.goals(raw)
+            if goal is not None:
+                goal = self._judge.practised(raw.obs, rng)
+                goals.append(goal.reshape(*lead, *goal.shape[1:]))
+            reward, end = self._judge.judged(raw, goal)
+            rewards.append(reward.reshape(lead))
+            ends.append(end.reshape(lead))
+        goal = np.concatenate(goals) if goals else None
+        return goal, np.concatenate(rewards), np.concatenate(ends)
+
     def _columns_of(self, shared: Mapping[str, Tensor]) -> Columns:
         """Return storage that holds the ``shared_rows`` of another store."""
         (num_envs,) = shared["newest"].shape

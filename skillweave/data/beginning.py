@@ -11,11 +11,15 @@ from gymnasium.spaces import Dict, Tuple
 from skillweave._internal.messages import short
 from skillweave._internal.paths import AGENT
 from skillweave._internal.seeding import Seeds
-from skillweave.algorithms.config import PPO, config_from_json
+from skillweave.algorithms.batches import INFO
+from skillweave.algorithms.config import PPO, config_from_json, is_offline
 from skillweave.algorithms.registry import make_algorithm
+from skillweave.buffers.judged import JudgedStore
+from skillweave.buffers.recorded_steps import MASK, RecordedSteps
 from skillweave.data.cloning import Clone, clone
 from skillweave.data.dataset import Dataset
 from skillweave.data.segmenting import Segments, segment
+from skillweave.envs.make import make_engine
 from skillweave.errors import DeclarationError
 from skillweave.experience.views import learner_obs, own_actions
 from skillweave.policies.core import Array
@@ -24,16 +28,19 @@ from skillweave.runs.manifest import Manifest
 from skillweave.skills.goals import goals_of
 from skillweave.skills.learnable import Learnable
 from skillweave.spaces import action_codec
+from skillweave.training.replay_learner import judge_of, store_of
 from skillweave.training.role import Role
 
 FEWEST = 20
 """The fewest rows from which a learner is cloned."""
+DIFFERENT = 0.01
+"""The share of steps whose rewards may differ when they are computed again."""
 
 
 def begin(
     declared: Any, content: Manifest, roles: Mapping[str, Role], data: Any
-) -> tuple[dict[str, Learnt], str]:
-    """Return the policies from which learners start, by name, and a sentence about each.
+) -> tuple[dict[str, Learnt], RecordedSteps | None, str]:
+    """Return what learners begin with.
 
     Args:
         declared: a hierarchy, or a plain agent.
@@ -41,19 +48,31 @@ def begin(
         roles: of its learners, by path.
         data: a ``Dataset``, or of a hierarchy the ``Segments`` that were cut out of one.
 
+    Returns:
+        The policies from which learners start, by name; the steps from which learners with a
+        replay learn, too, None if there is none of these; and a sentence about each learner.
+
     Raises:
-        DeclarationError: it is neither, or has other spaces; or nothing can be cloned from it.
+        DeclarationError: it is neither, or has other spaces; or no learner learns from it.
     """
     flat = content.hierarchy is None
     if not isinstance(data, Dataset if flat else Dataset | Segments):
         kinds = "a Dataset" if flat else "a Dataset, or what hierarchy.segment() returned"
         raise DeclarationError(f"data is {short(data)}; it must be {kinds}")
-    found = data if flat or isinstance(data, Segments) else segment(declared, data)
-    episodes = found.data if isinstance(found, Segments) else found
+    episodes = data.data if isinstance(data, Segments) else data
     episodes.check_env(declared.spec)
+    settings = _first_settings(content)
+    readers = [name for name, config in settings.items() if _reads(config, roles[name])]
+    recorded = episodes.recorded() if readers else None
+    found: Dataset | Segments = data
+    if not flat and isinstance(data, Dataset) and len(readers) < len(settings):
+        found = segment(declared, data)
     learnt: dict[str, Learnt] = {}
     notes = []
-    for name, config in _first_settings(content).items():
+    for name, config in settings.items():
+        if recorded is not None and name in readers:
+            notes.append(f"{name} learns from {_readable(config, roles[name], recorded, episodes)}")
+            continue
         why = _why_not(config, roles[name])
         rows = None if why else _rows(name, found, roles[name])
         if not why and (rows is None or len(rows[0]) < FEWEST):
@@ -71,9 +90,75 @@ def begin(
         of = made.policy, sha256, made.rows, episodes.name, None, chooses
         learnt[name] = Learnt(*of, critic=False)
         notes.append(f"{name} is cloned: {made}")
-    if not learnt:
-        raise DeclarationError(f"nothing can be cloned from {episodes.name}: {'; '.join(notes)}")
-    return learnt, "; ".join(notes)
+    if not learnt and recorded is None:
+        raise DeclarationError(f"no learner begins with {episodes.name}: {'; '.join(notes)}")
+    return learnt, recorded, "; ".join(notes)
+
+
+def _reads(config: Any, role: Role) -> bool:
+    """Return whether a learner has recorded steps in its replay."""
+    return bool(getattr(config, "shared_replay", 0.0)) and role.kind in ("agent", "skill")
+
+
+def _readable(config: Any, role: Role, steps: RecordedSteps, data: Dataset) -> str:
+    """Return how many recorded steps a learner can learn from, in words.
+
+    Raises:
+        DeclarationError: it cannot judge them; or they lack what it reads.
+    """
+    judge = judge_of(config, role)
+    assert judge is not None
+    needed = [key.removeprefix(INFO) for key in judge.examples if key.startswith(INFO)]
+    if lacks := [key for key in needed if key not in steps.info]:
+        has = ", ".join(steps.info) or "none"
+        raise DeclarationError(
+            f"{judge.who} reads info[{lacks[0]!r}] in its reward or termination, but {data.name} "
+            f"has the keys {has} of info"
+        )
+    if MASK not in steps.info and _masks(role):
+        raise DeclarationError(
+            f"{judge.who} is in an environment with action masks, but {data.name} has no "
+            f"info[{MASK!r}]: values would be learnt of actions that were not allowed"
+        )
+    algorithm: Any = make_algorithm(config, *role.spaces)
+    store = store_of(algorithm, 1, judge=judge, capacity=steps.slots + 2)
+    assert isinstance(store, JudgedStore)
+    rng = (Seeds(0) / "data").numpy()
+    rows = store.add_recorded(steps.rows(1, store.raw), rng)
+    count = int(rows["valid"].sum())
+    if not count:
+        raise DeclarationError(
+            f"{judge.who} could have made no step of {data.name}: its part of the action (acts) "
+            "leaves the rest as it is, and there the rest always differs"
+        )
+    if role.kind == "agent":
+        _compare_rewards(judge.who, rows["reward"].ravel(), steps.reward, data.name)
+    if is_offline(config):
+        return f"{count:,} steps of {data.name} first, by gradient steps"
+    return f"{count:,} steps of {data.name}"
+
+
+def _compare_rewards(who: str, now: Array, given: Array, name: str) -> None:
+    """Raise a DeclarationError where rewards that are computed again differ from the data's."""
+    scale = float(np.abs(given).max(initial=0.01))
+    differ = ~np.isclose(now, given, rtol=1e-4, atol=1e-4 * scale)
+    if differ.mean() > DIFFERENT:
+        at = int(differ.argmax())
+        raise DeclarationError(
+            f"{who} computes rewards again (hindsight), but in {differ.mean():.0%} of the steps of "
+            f"{name} they differ from those that were recorded (in step {at} {now[at]:g}, recorded "
+            f"{given[at]:g}): the data have another reward, or another goal"
+        )
+
+
+def _masks(role: Role) -> bool:
+    """Return whether an environment says which actions are allowed."""
+    engine = make_engine(role.spec, 1)
+    try:
+        engine.reset(0)
+        return engine.mask() is not None
+    finally:
+        engine.close()
 
 
 def _first_settings(content: Manifest) -> dict[str, Any]:
@@ -90,6 +175,8 @@ def _why_not(config: Any, role: Role) -> str:
     """Return why a learner is not cloned; empty: it is."""
     if role.kind == "critic":
         return "it is a critic"
+    if hasattr(config, "shared_replay") and role.kind != "selector":
+        return f"{type(config).__name__} learns from data by shared_replay, which is 0"
     if not isinstance(config, PPO):
         return f"{type(config).__name__} has no network whose actions can be cloned"
     if config.squash_actions and isinstance(role.action_space, Dict | Tuple):

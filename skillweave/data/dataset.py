@@ -11,6 +11,8 @@ import numpy as np
 from skillweave._internal.arguments import checked_names
 from skillweave._internal.messages import short
 from skillweave._internal.notebooks import paragraph
+from skillweave.algorithms.batches import number_type
+from skillweave.buffers.recorded_steps import RecordedSteps
 from skillweave.calls.log import CallLog
 from skillweave.data.minari_files import read_minari, write_minari
 from skillweave.envs.make import EnvSpec
@@ -201,6 +203,15 @@ class Dataset:
         truncated = self.truncated[last] & ~terminated
         counts = int(terminated.sum()), int(truncated.sum())
         return dict(zip(ENDS, (*counts, len(self) - sum(counts)), strict=True))
+
+    def recorded(self) -> RecordedSteps:
+        """Return the steps as replay buffers take them."""
+        last = np.zeros(self.steps, bool)
+        last[self.offset[1:] - 1] = True
+        elapsed = np.arange(self.steps) - np.repeat(self.offset[:-1], self.lengths) + 1
+        columns = self.obs, self.next_obs, self.action, self.reward, self.terminated, self.truncated
+        info = {key: x.astype(number_type(x.dtype)) for key, x in self.info.items()}
+        return RecordedSteps(*columns, elapsed, last, info, self.name)
 
     def episode(self, number: int) -> dict[str, Any]:
         """Return an episode as arrays by Minari's names; see the class.

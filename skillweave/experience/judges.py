@@ -339,6 +339,55 @@ class Sharing:
         return found
 
 
+class AgentJudge:
+    """The judge of a plain agent: its rewards and ends are those that were recorded."""
+
+    def __init__(self, spec: EnvSpec) -> None:
+        self.who = f"the environment {spec.name}"
+        self.observation_space: gym.Space[Any] = spec.spaces.observation
+        self._codec = action_codec(spec.spaces.action)
+        self.choices = sum(choice_counts(spec.spaces.action))
+        self.examples: Mapping[str, Array] = {
+            "env_action": space_of(spec.spaces.action).start(1),
+            "env_reward": np.zeros(1, np.float32),
+            "env_terminated": np.zeros(1, bool),
+        }
+
+    def goals(self, rows: RawRows) -> None:
+        """Return None: it has no goals."""
+
+    def practised(self, obs: Array, rng: np.random.Generator) -> Array:
+        """Raise an error: it has no goals."""
+        raise NotImplementedError
+
+    def achieved(self, obs: Array) -> Array:
+        """Raise an error: it has no goals."""
+        raise NotImplementedError
+
+    def judged(self, rows: RawRows, goal: Array | None) -> tuple[Array, Array]:
+        """Return the recorded rewards and ends."""
+        return rows.columns["env_reward"], rows.columns["env_terminated"]
+
+    def check(self, rows: RawRows, goal: Array, *, differ: bool) -> None:
+        """Raise an error: it has no goals."""
+        raise NotImplementedError
+
+    def check_shared(self, rows: RawRows, goal: Array | None) -> None:
+        """Do nothing: recorded rewards do not depend on who acted."""
+
+    def seen(self, obs: Array, goal: Array | None) -> Array:
+        """Return observations (…) as they are."""
+        return obs
+
+    def mask(self, mask: Array | None) -> Array | None:
+        """Return the environment's action masks as they are."""
+        return mask
+
+    def action(self, env_action: Array) -> tuple[Array, Array]:
+        """Return the environment's actions (k, …) in policy units, all of them possible."""
+        return self._codec.from_env(env_action), np.ones(len(env_action), bool)
+
+
 class GoalEnvJudge:
     """The judge of a plain agent in an environment of goals: the environment itself.
 
@@ -382,6 +431,7 @@ class GoalEnvJudge:
             "call_elapsed": np.zeros(1, np.int64),
         }
         self.choices = sum(choice_counts(spec.spaces.action))
+        self._codec = action_codec(spec.spaces.action)
 
     @staticmethod
     def _method(env: gym.Env[Any, Any], name: str) -> Any:
@@ -393,8 +443,9 @@ class GoalEnvJudge:
         return desired
 
     def practised(self, obs: Array, rng: np.random.Generator) -> Array:
-        """Raise an error: an environment draws its goals itself, and shares no steps."""
-        raise NotImplementedError
+        """Return the goals that recorded observations (k,) had: an environment draws them."""
+        desired: Array = obs[DESIRED].copy()
+        return desired
 
     def achieved(self, obs: Array) -> Array:
         """Return the goals that observations (k,) have reached."""
@@ -437,12 +488,11 @@ class GoalEnvJudge:
         return mask
 
     def action(self, env_action: Array) -> tuple[Array, Array]:
-        """Raise an error: an agent has no other skills' steps."""
-        raise NotImplementedError
+        """Return the environment's actions (k, …) in policy units, all of them possible."""
+        return self._codec.from_env(env_action), np.ones(len(env_action), bool)
 
     def check_shared(self, rows: RawRows, goal: Array | None) -> None:
-        """Raise an error: an agent has no other skills' steps."""
-        raise NotImplementedError
+        """Do nothing: rewards are computed of goals alone."""
 
     def _answers(self, name: str, method: Any, reached: Array, goal: Array, kind: Any) -> Array:
         """Return a method's answers (k,), of all pairs at once if it takes them so."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from skillweave._internal.shapes import Float
+from skillweave.ops.distributions import mask_logits
 from skillweave.ops.moments import masked_mean
 
 LARGEST_LOG_RATIO = 20.0
@@ -126,6 +127,33 @@ def critic_loss(q: Tensor, target: Tensor, weight: Tensor | None) -> tuple[Tenso
     loss = weighted_mean(td_loss(q, target, "mse").sum(1), weight)
     error = (q.detach() - target).abs().mean(1)
     return loss, error, q.detach().mean((1, 2))
+
+
+def expectile_loss(
+    value: Float[Tensor, "*batch"], target: Float[Tensor, "*batch"], expectile: float
+) -> Float[Tensor, "*batch"]:
+    """Compute ``|τ − 1(u < 0)|·u²`` of ``u = target − value`` (Kostrikov et al. 2022, eq. 5).
+
+    At 0.5 it is half the squared error; near 1 the value becomes the largest of its targets.
+
+    Args:
+        expectile: τ.
+    """
+    error = target - value
+    return torch.where(error < 0, 1.0 - expectile, expectile) * error.square()
+
+
+def conservative_cost(
+    q: Float[Tensor, "P B A"], action: Tensor, mask: Tensor | None
+) -> Float[Tensor, "P B"]:
+    """Compute ``log Σₐ exp Q(a) − Q(a_data)`` (Kumar et al. 2020, eq. 4).
+
+    Args:
+        action: (P, B) int64, those of the data.
+        mask: (P, B, A) bool, actions that count; None: all.
+    """
+    of_data = q.gather(-1, action[..., None]).squeeze(-1)
+    return mask_logits(q, mask).logsumexp(-1) - of_data
 
 
 def expected_soft_value(log_p: Tensor, q: Tensor, alpha: Tensor) -> Tensor:

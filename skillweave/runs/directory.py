@@ -7,6 +7,7 @@ evaluation.json              the latest evaluation (``training/evaluation_file.p
 evaluation-sampled.json      the latest evaluation that sampled actions on request
 checkpoint.safetensors       the latest checkpoint of the stage in training (and the one before)
 calls.safetensors            calls of the skills (``calls/run_log.py``)
+data.safetensors             steps from elsewhere, from which learners with a replay learn, too
 policies/<stage>.safetensors policies of finished stages
 states/<name>.safetensors    states of learners that continue in a later stage, until that is done
 replay/<skill>.safetensors   steps of a skill that shares its replay, until the last one is done
@@ -76,6 +77,8 @@ CALLS = "calls.safetensors"
 """The file of logged calls."""
 CALLS_LOCK = ".calls.lock"
 """The file that a process locks while it adds calls."""
+DATA = "data.safetensors"
+"""The file of steps that were recorded elsewhere."""
 FINAL = "final"
 """The folder of final states."""
 REPLAY = "replay"
@@ -89,7 +92,7 @@ LONGEST_NAME = 255
 MORE = 14
 """Additional characters of a file's name while it is written."""
 
-FILES = ("run.json", "metrics.jsonl", "lineage.jsonl", LOCK, TEMPORARY)
+FILES = ("run.json", "metrics.jsonl", "lineage.jsonl", DATA, LOCK, TEMPORARY)
 """Files that training writes before the first checkpoint."""
 FOLDERS = {
     "policies": (TEMPORARY,),
@@ -478,6 +481,29 @@ class RunDirectory:
             tensors, header = read_tensors(path, most=None)
             self.must_be_ours(header.get("run"), path)
             yield tensors
+
+    def save_data(self, tensors: Mapping[str, Tensor]) -> None:
+        """Write the steps from which learners of a new run learn, too."""
+        header = {"run": self.manifest.id}
+        write_tensors(self.path / DATA, tensors, header, make_directories=False)
+
+    def load_data(self) -> dict[str, Tensor] | None:
+        """Return the tensors of ``save_data``; None: the run has none.
+
+        Raises:
+            RunError: the file is missing or damaged, or belongs to another run.
+        """
+        if self.manifest.data is None:
+            return None
+        path = self.path / DATA
+        if not path.exists():
+            raise RunError(
+                f"{path} is not there any more: the run learns from these steps, too; begin a new "
+                "run with data=..."
+            )
+        tensors, header = read_tensors(path, most=None)
+        self.must_be_ours(header.get("run"), path)
+        return tensors
 
     def drop_used(self, entry: StageEntry) -> None:
         """Remove the files of a finished stage that no later stage needs.

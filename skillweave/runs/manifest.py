@@ -420,6 +420,8 @@ class Manifest(Recorded):
     eval_episodes: AtLeastOne
     keep: Literal["last", "best"] = "last"
     """The weights that stages end with."""
+    data: NoSetting[str | None] = None
+    """The name of the data from which learners with a replay learn, too; None: there are none."""
     log_info: NoSetting[tuple[str, ...]]
     """Logged keys of ``info``."""
     log_calls: NoSetting[AtLeastOne | None] = None

@@ -19,11 +19,13 @@ from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm, stat
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.batches import Reference
 from skillweave.algorithms.config import config_from_json
+from skillweave.buffers.recorded_steps import RecordedSteps
 from skillweave.envs.checked import longest_evaluation
 from skillweave.envs.engine import Engine
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience.acting import Acting, Request
-from skillweave.experience.collector import Collector
+from skillweave.experience.collector import FIRST_INFO, Collector
+from skillweave.experience.group import CollectorGroup
 from skillweave.ops.device import resolve_device
 from skillweave.ops.threads import torch_threads
 from skillweave.policies.core import Array
@@ -37,6 +39,7 @@ from skillweave.training.keep_best import KeepBest
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Loop, LoopState, Saved
+from skillweave.training.offline import AfterData, data_steps_of
 from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 from skillweave.training.rehearsal import rehearse
 from skillweave.training.replay_learner import ReplayLearner, judge_of
@@ -98,16 +101,32 @@ class Agents:
         # Before the collectors: an environment may exist only once at a time.
         self.judges = {k: judge_of(a.config, self.roles[k]) for k, a in self.algorithms.items()}
         self.earlier = {name: self._earlier_policy(name) for name in self.algorithms}
-        how = task, self._acting(), self._margins(), stage.seeds / "global"
-        self.collectors = self._make_collectors(
-            partial(_collector, *how), num_envs, self.entry.workers, 1, task.role.spec.name
-        )
+        self.collectors = self._collectors(num_envs)
         self._resources.callback(self.collectors.close)
         every, episodes = manifest.eval_every, manifest.eval_episodes
         self.evaluation = PeriodicEvaluation(task, stage.seeds, every, episodes, num_envs)
         self._resources.callback(self.evaluation.close)
         target = self.entry.target
         self.best = KeepBest("return" if target is None else target.of, manifest.keep == "best")
+
+    def _collectors(self, num_envs: int) -> CollectorGroup:
+        """Return the collectors of the stage; while it learns from data alone, they only wait."""
+        task, budget = self.task, self.entry.budget
+        how = task, self._acting(), self._margins(), self.stage.seeds / "global"
+        data_steps = self._data_steps()
+        made = None
+        if data_steps < budget:
+            made = self._make_collectors(
+                partial(_collector, *how), num_envs, self.entry.workers, 1, task.role.spec.name
+            )
+        if not data_steps:
+            assert made is not None
+            return made
+        return AfterData(made, num_envs, FIRST_INFO + len(task.log_info))
+
+    def _data_steps(self) -> int:
+        """Return the steps of the stage that are gradient steps on data alone."""
+        return data_steps_of(self.stage.config, self.entry.budget)
 
     def _config(self, name: str) -> Any:
         """Return a learner's settings, with the networks that it has grown in a population."""
@@ -167,6 +186,8 @@ class Agents:
             how = self.level, self.together.task_weight, self.entry.task_weights
             self.learner = self.joint = JointLearner(self.learners, *how)
         self.best.load(log.at.kept_best, tensors, self.states(), str(log.run.path))
+        if isinstance(self.collectors, AfterData):
+            self.collectors.data_left = max(0, self._data_steps() - log.at.steps)
         recorder = self.stage.recorder
         self.loop = loop = Loop(
             self.learner,
@@ -195,6 +216,12 @@ class Agents:
         if tensors:
             saved = unprefixed(f"state.{name}", tensors)
             state = state_from(saved, state, f"{self.log.run.path}: {name}")
+        judge = self.judges[name]
+        data_steps = self._data_steps()
+        data = self._data() if judge is not None and algorithm.config.shared_replay else None
+        capacity = None
+        if data is not None and data_steps == self.entry.budget:
+            capacity = data.slots + 2 * self.entry.num_envs  # it holds nothing else
         learner = learner_of(
             Stack(algorithm, state_to(state, device)),
             self.entry.num_envs,
@@ -202,8 +229,12 @@ class Agents:
             self._quota(name),
             row_steps=self.roles[name].row_steps,
             goes_on_at=self.log.at.steps,
-            judge=self.judges[name],
+            judge=judge,
+            data_steps=data_steps,
+            capacity=capacity,
         )
+        if isinstance(learner, ReplayLearner) and data is not None:
+            learner.begin_with_data(data, scales=not tensors)
         if isinstance(learner, ReplayLearner) and not tensors:
             for rows in self.stage.run.load_rows(self.entry):
                 if rows:
@@ -220,6 +251,14 @@ class Agents:
         elif self.earlier[name] is not None or name in self.entry.starts:
             learner.act_from_the_start()
         return learner
+
+    def _data(self) -> RecordedSteps | None:
+        """Return the steps that were given with ``data``; None: the run has none."""
+        tensors = self.stage.run.load_data()
+        spaces = self.task.role.spec.spaces
+        if tensors is None:
+            return None
+        return RecordedSteps.from_tensors(tensors, spaces.observation, spaces.action)
 
     def _seeds(self, name: str) -> Seeds:
         return self.stage.seeds / name if self.together else self.stage.seeds

@@ -16,11 +16,12 @@ from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.batches import OF_STEP, Batch, RawRows
 from skillweave.algorithms.config import JUDGES_AGAIN
 from skillweave.buffers.judged import Judge, JudgedStore
+from skillweave.buffers.recorded_steps import RecordedSteps
 from skillweave.buffers.replay import ReplayStore
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.experience.acting import ActionRepeat, Request
-from skillweave.experience.judges import GoalEnvJudge, SkillJudge, first_step
+from skillweave.experience.judges import AgentJudge, GoalEnvJudge, SkillJudge, first_step
 from skillweave.ops.device import resolve_device
 from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
@@ -127,9 +128,33 @@ class ReplayLearner:
         for batch in self.store.begin_with(shared):
             self._see(batch)
 
+    def begin_with_data(self, data: RecordedSteps, *, scales: bool = True) -> None:
+        """Begin with steps that were recorded elsewhere.
+
+        Args:
+            data: of the environment.
+            scales: update the running scales of observations and returns, too.
+
+        Raises:
+            SkillweaveError: the learner's skill cannot judge them.
+        """
+        store = self.store
+        assert isinstance(store, JudgedStore)
+        rng = (self._seeds / "data").numpy()
+        batch = store.add_recorded(data.rows(store.num_envs, store.raw), rng)
+        if not scales:
+            return
+        self._update_obs_stats(batch["obs"], batch["valid"])
+        if any(s.algorithm.scales_rewards for s in self.stacks):
+            self._scale_returns(batch)
+            self._returns = None
+
     def _see(self, batch: Batch) -> None:
         """Update the running scales of observations."""
-        obs, valid = self.store.seen(batch)
+        self._update_obs_stats(*self.store.seen(batch))
+
+    def _update_obs_stats(self, obs: Array, valid: Array | None) -> None:
+        """Update the running scales with observations (T, N, …) where ``valid`` (T, N)."""
         for i, stack in enumerate(self.stacks):
             columns = self._columns(i)
             stack.algorithm.update_obs_stats(
@@ -176,13 +201,19 @@ class ReplayLearner:
             return {}
         return {k: torch.cat([m[k] for m in metrics]) for k in metrics[0]}
 
-    def _learn(self, at: int, update: int, progress: float) -> dict[str, Tensor]:
-        """Make the gradient steps of the stack number ``at``; return the metrics of the last."""
+    def _learn(
+        self, at: int, update: int, progress: float, due: int | None = None
+    ) -> dict[str, Tensor]:
+        """Make the gradient steps of the stack number ``at``; return the metrics of the last.
+
+        Args:
+            due: the gradient steps; None: by the transitions since the latest update.
+        """
         stack = self.stacks[at]
         first = self._first[at]
         cfg = stack.algorithm.config
         before, after = (int(t * cfg.update_ratio) for t in self._transitions)
-        due = after - before
+        due = after - before if due is None else due
         metrics: dict[str, Tensor] = {}
         beta = cfg.priority_beta + progress * (1.0 - cfg.priority_beta)
         seeds = member_seeds(self._seeds, "learn", stack.members, update, first)
@@ -257,13 +288,8 @@ def judge_of(config: Any, role: Role) -> Judge | None:
     if setting is None:
         return None
     spaces = role.spec.spaces
-    if role.kind == "agent" and config.shared_replay:
-        raise DeclarationError(
-            "a plain agent has no skills beside it that could share their steps: leave out "
-            "shared_replay, or train a Hierarchy"
-        )
     if role.kind == "agent":
-        return GoalEnvJudge(role.spec)
+        return GoalEnvJudge(role.spec) if config.hindsight else AgentJudge(role.spec)
     if role.skill is None:
         for_whom = "skills with goals and for plain agents" if config.hindsight else "skills"
         raise DeclarationError(
@@ -310,6 +336,7 @@ def store_of(
     *,
     shared: bool = False,
     judge: Judge | None = None,
+    capacity: int | None = None,
 ) -> ReplayStore:
     """Return an empty replay store for an algorithm's samples.
 
@@ -317,13 +344,14 @@ def store_of(
         num_envs: of all members together.
         shared: each member learns from the experience of all.
         judge: judges rows again; None: nobody does.
+        capacity: of all columns together; None: by ``buffer_size``.
 
     Raises:
         TrainingError: the store is larger than the machine's memory.
         DeclarationError: the store is smaller than one row.
     """
     config, codec = algorithm.config, algorithm.codec
-    capacity = config.buffer_size * (1 if shared else members)
+    capacity = capacity or config.buffer_size * (1 if shared else members)
     device = resolve_device(config.device)
     if judge is not None:
         return JudgedStore(

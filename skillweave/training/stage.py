@@ -7,13 +7,14 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from skillweave._internal.notices import notice
-from skillweave._internal.paths import SELECTOR, join, level_of
+from skillweave._internal.paths import SELECTOR, decides, join, level_of
 from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import (
     AlgorithmConfig,
     config_from_json,
     config_to_json,
+    is_offline,
     own_encoders,
 )
 from skillweave.algorithms.schedules import own_schedules
@@ -173,7 +174,8 @@ def check_stages(entries: Sequence[StageEntry], eval_every: int | None, keep: st
             raise reworded(error, f"{where}: {error}") from error
         starts = entry.algorithm.get("learning_starts", 0)
         budget = entry.budget // entry.members
-        if budget <= starts:
+        offline = is_offline(config_from_json(entry.algorithm))
+        if budget <= starts and not offline:
             each = " for each member" if entry.members > 1 else ""
             raise DeclarationError(
                 f"{where}: its budget is {budget:,} steps{each}, but it begins to learn only after "
@@ -199,13 +201,82 @@ def check_stages(entries: Sequence[StageEntry], eval_every: int | None, keep: st
             )
 
 
+def check_data(entries: Sequence[StageEntry], roles: Mapping[str, Role], *, given: bool) -> None:
+    """Raise a DeclarationError where learners cannot learn from data as their settings say.
+
+    Args:
+        entries: of a new run.
+        roles: of its learners, by path.
+        given: there are data.
+    """
+    for entry in entries:
+        for name in entry.learns:
+            config = config_from_json(entry.algorithms.get(name, entry.algorithm))
+            kind = type(config).__name__
+            who = f"stage {entry.name!r}: {name!r} learns by {kind}"
+            shares = getattr(config, "shared_replay", 0.0)
+            if roles[name].kind == "agent" and shares and not given and not is_offline(config):
+                raise DeclarationError(
+                    f"{who} with shared_replay, but a plain agent has no skills beside it that "
+                    "could share their steps: give steps of others, data=..., or leave out "
+                    "shared_replay"
+                )
+            if not is_offline(config):
+                continue
+            if not given:
+                raise DeclarationError(
+                    f"{who}, which learns from recorded steps: give them, data=... (a Dataset), or "
+                    f"let it step the environment alone, {kind}(online=1.0, shared_replay=0.0)"
+                )
+            if decides(name):
+                raise DeclarationError(
+                    f"{who}, which is for skills and plain agents: let the selector learn by PPO, "
+                    "which begins from data, too"
+                )
+            if entry.kind == "together" or entry.evolution is not None:
+                how = "a population" if entry.evolution else "skills that learn together"
+                other = "leave out evolve" if entry.evolution else 'learn="apart"'
+                raise DeclarationError(
+                    f"{who}, which learns from data alone first, and {how} cannot: {other}"
+                )
+
+
+def check_room(entries: Sequence[StageEntry], slots: int) -> None:
+    """Check that replay buffers have the room for data.
+
+    Args:
+        slots: the room that the data need in a buffer.
+
+    Raises:
+        DeclarationError: a buffer is smaller.
+    """
+    for entry in entries:
+        config: Any = config_from_json(entry.algorithm)
+        alone = getattr(config, "online", 1.0) == 0.0
+        if not getattr(config, "shared_replay", 0.0) or alone:
+            continue
+        size, all_steps = config.buffer_size, slots + entry.budget
+        if size < slots + 2 * config.num_envs:
+            raise DeclarationError(
+                f"stage {entry.name!r}: buffer_size is {size:,}, but the data take {slots:,} of "
+                f"its places: give buffer_size={all_steps:,}, for the data and the stage's steps"
+            )
+        if size < all_steps:
+            notice(
+                f"stage {entry.name!r}: buffer_size is {size:,}, so its own steps replace the "
+                f"{slots:,} of the data before its budget of {entry.budget:,} is spent; "
+                f"buffer_size={all_steps:,} holds all"
+            )
+
+
 def _check_sharing(entries: Sequence[StageEntry]) -> None:
     """Raise a DeclarationError where skills that learn apart cannot begin with earlier steps."""
     levels: dict[str, list[StageEntry]] = {}
     for entry in entries:
         if entry.shares:
             levels.setdefault(level_of(entry.name), []).append(entry)
-        if entry.evolution is not None and entry.algorithm.get("shared_replay"):
+        offline = is_offline(config_from_json(entry.algorithm))
+        if entry.evolution is not None and entry.algorithm.get("shared_replay") and not offline:
             raise DeclarationError(
                 f"stage {entry.name!r}: it evolves, and its algorithm has shared_replay, which is "
                 "not for populations: leave out one of them"

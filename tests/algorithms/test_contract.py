@@ -29,7 +29,9 @@ from skillweave._internal.seeding import Seeds
 from skillweave.algorithms import config as table
 from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy, make_algorithm
 from skillweave.algorithms.config import (
+    CQL,
     DQN,
+    IQL,
     PPO,
     SAC,
     TD3,
@@ -78,6 +80,9 @@ SEEING = {
 SEEING_TWIN = TD3(**SEEING | {"learning_rate": 3e-3})
 SEEING_DDPG = TD3.ddpg(**SEEING)
 SOFT = SAC(**BUFFERED, ent_coef=0.1)
+ALONE = {"online": 1.0, "shared_replay": 0.0}  # these algorithms also learn without data
+CAUTIOUS = CQL(**BUFFERED, **ALONE, cql_alpha=0.1)
+IMPLICIT = IQL(**BUFFERED, **ALONE, beta=10.0, expectile=0.6)
 
 
 @dataclass(frozen=True)
@@ -152,6 +157,11 @@ TABLE = {
         ("sac", SOFT, "multi-binary", "Discrete", 400),
         ("sac", SOFT, "image, channels first", "Discrete", 400),
         ("sac", SOFT, "tuple", "Discrete", 400),
+        ("cql", CAUTIOUS, "vector", "Discrete", 320),
+        ("cql", CAUTIOUS, "tuple", "Discrete", 320),
+        ("iql", IMPLICIT, "vector", "Box", 1600),
+        ("iql", IMPLICIT, "multi-binary", "Discrete", 800),
+        ("iql", IMPLICIT, "dict", "Discrete", 800),
     ]
 }
 FIRST = {name.split(",")[0]: name for name in reversed(TABLE)}.values()
@@ -259,6 +269,8 @@ SCALED = {"normalize_obs": True, "normalize_rewards": True}
 @pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("config", [replace(ON, normalize_obs=True), *(
     kind(**BUFFERED, **SCALED) for kind in (DQN, TD3, SAC)
+), *(
+    kind(**BUFFERED, **SCALED, **ALONE) for kind in (CQL, IQL)
 )], ids=lambda c: type(c).__name__)  # fmt: skip
 def test_what_is_learnt_keeps_shape_and_type_and_can_be_changed_in_place(config):
     env = Echo(8, "vector", "Box" if isinstance(config, TD3) else "Discrete")
@@ -291,8 +303,13 @@ VALUED = {
     "ddpg": TD3.ddpg(**EXACT),
     "sac of choices": SAC(**EXACT, **COLD),
     "sac of forces": SAC(**EXACT, **COLD),
+    "cql": CQL(**EXACT, **ALONE, cql_alpha=1e-3),
+    "iql of choices": IQL(**EXACT, **ALONE),
+    "iql of forces": IQL(**EXACT, **ALONE),
 }
-CHOOSERS = [name for name in VALUED if name not in ("td3", "ddpg", "sac of forces")]
+CHOOSERS = [
+    name for name in VALUED if name not in ("td3", "ddpg", "sac of forces", "iql of forces")
+]
 
 
 def acted_in(env, name: str):
@@ -573,10 +590,10 @@ def test_without_a_memory_it_is_a_guess():
 # What cannot be
 
 
-KINDS = (PPO, SelfImitationPPO, DQN, TD3, SAC)
+KINDS = (PPO, SelfImitationPPO, DQN, CQL, TD3, SAC, IQL)
 ABLE = [
-    (gym.spaces.Discrete(2), (PPO, SelfImitationPPO, DQN, SAC)),
-    (gym.spaces.Box(-1.0, 1.0, (2,)), (PPO, SelfImitationPPO, TD3, SAC)),
+    (gym.spaces.Discrete(2), (PPO, SelfImitationPPO, DQN, CQL, SAC, IQL)),
+    (gym.spaces.Box(-1.0, 1.0, (2,)), (PPO, SelfImitationPPO, TD3, SAC, IQL)),
     (gym.spaces.MultiDiscrete([2, 2]), (PPO, SelfImitationPPO)),
     (gym.spaces.MultiBinary(3), (PPO, SelfImitationPPO)),
     (gym.spaces.Dict(arm=gym.spaces.Box(-1, 1, (2,)), grip=gym.spaces.Discrete(2)), KINDS[:2]),

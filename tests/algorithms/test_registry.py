@@ -164,7 +164,7 @@ MISTAKES = {
     ),
     "a discrete space": (
         lambda: make_algorithm((own(), named_config("TD3", "here"))[1], BOX, LINE),
-        "TD3 cannot .*Discrete.*; PPO, SelfImitationPPO, DQN, SAC, A2C",
+        "TD3 cannot .*Discrete.*; PPO, SelfImitationPPO, DQN, CQL, SAC, IQL, A2C",
     ),
 }
 

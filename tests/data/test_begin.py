@@ -185,9 +185,11 @@ def test_what_cannot_be_cloned_is_said(data: sw.Dataset, tmp_path: Path, capsys:
         selector=sw.PPO(num_envs=4, n_steps=32), learn="apart",
     ).train(tmp_path / "a", data=data)  # fmt: skip
     said = capsys.readouterr().err
-    assert "reach is not cloned: DQN has no network whose actions can be cloned" in said
+    assert "reach is not cloned: DQN learns from data by shared_replay, which is 0" in said
     assert "selector is cloned" in said
-    with pytest.raises(DeclarationError, match=r"nothing can be cloned from .*DQN has no network"):
+    with pytest.raises(
+        DeclarationError, match=r"no learner begins with .*shared_replay, which is 0"
+    ):
         sw.train_agent(spec(), sw.DQN(), steps=5_000, run_dir=tmp_path / "b", data=data, quiet=True)
     assert not (tmp_path / "b").exists()
     with pytest.raises(DeclarationError, match="data is 5; it must be a Dataset"):

@@ -6,6 +6,8 @@ import torch
 from skillweave.ops.losses import (
     approximate_kl,
     categorical_projection,
+    conservative_cost,
+    expectile_loss,
     likelihood_ratio,
     ppo_policy_loss,
     value_loss,
@@ -117,3 +119,24 @@ def test_ratios_that_are_not_finite_are_held_at_a_large_number():
     assert loss.item() == pytest.approx(math.e * (math.exp(20.0) - 1.2) / 3, rel=1e-5)
     assert log_prob.grad.isfinite().all()
     assert approximate_kl(log_prob, old, weight).isfinite().all()
+
+
+def test_an_expectile_leans_to_the_side_that_costs_more():
+    value = torch.tensor([[1.0, 1.0]])
+    target = torch.tensor([[3.0, -1.0]])
+    assert expectile_loss(value, target, 0.7).tolist() == [pytest.approx([0.7 * 4, 0.3 * 4])]
+    # The value of least loss of two equally likely targets 0 and 1 is the expectile itself.
+    values = torch.linspace(0, 1, 101)[None]
+    loss = expectile_loss(values, torch.zeros(1, 101), 0.9)
+    loss = loss + expectile_loss(values, torch.ones(1, 101), 0.9)
+    assert values[0, loss.argmin()].item() == pytest.approx(0.9)
+
+
+def test_the_conservative_cost_is_what_other_actions_promise_beyond_those_of_the_data():
+    q = torch.tensor([[[1.0, 3.0, 50.0]]])
+    action = torch.tensor([[0]])
+    allowed = torch.tensor([[[True, True, False]]])
+    assert conservative_cost(q, action, allowed).item() == pytest.approx(
+        math.log(math.exp(1.0) + math.exp(3.0)) - 1.0
+    )
+    assert conservative_cost(q, action, None).item() == pytest.approx(49.0, abs=1e-3)
