@@ -16,8 +16,8 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NAMES = """
 Acts Agent Apart Automaton CQL DQN Dataset Elapsed EnvSpec Goal Guide Hierarchy IQL LastAction
 Lengths Network PPO Part Player Reflex Residual Run SAC Selection Skill SkillweaveError Step TD3
-Table Together TrainDefaults evaluate from_deploy from_function from_hub from_metadata from_onnx from_sb3
-from_torch handovers inputs load load_policy record reference_motion save_policy
+Table Together TrainDefaults evaluate from_deploy from_function from_hub from_metadata from_onnx
+from_sb3 from_torch handovers inputs load load_policy record reference_motion save_policy
 train_agent tree
 """
 

@@ -14,7 +14,7 @@ from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.batches import OF_STEP, Batch, RawRows
-from skillweave.algorithms.config import JUDGES_AGAIN
+from skillweave.algorithms.config import JUDGES_AGAIN, is_offline
 from skillweave.buffers.judged import Judge, JudgedStore
 from skillweave.buffers.recorded_steps import RecordedSteps
 from skillweave.buffers.replay import ReplayStore
@@ -291,6 +291,11 @@ def judge_of(config: Any, role: Role) -> Judge | None:
     if role.kind == "agent":
         return GoalEnvJudge(role.spec) if config.hindsight else AgentJudge(role.spec)
     if role.skill is None:
+        if is_offline(config):
+            raise DeclarationError(
+                f"the {role.kind} {role.path!r} cannot learn by {type(config).__name__}, which is "
+                "for skills and plain agents: let it learn by PPO, which begins from data, too"
+            )
         for_whom = "skills with goals and for plain agents" if config.hindsight else "skills"
         raise DeclarationError(
             f"the {role.kind} {role.path!r} cannot learn with {setting}, which is for {for_whom}: "

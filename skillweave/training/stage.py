@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from skillweave._internal.notices import notice
-from skillweave._internal.paths import SELECTOR, decides, join, level_of
+from skillweave._internal.paths import SELECTOR, join, level_of
 from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import make_algorithm
 from skillweave.algorithms.config import (
@@ -182,7 +182,9 @@ def check_stages(entries: Sequence[StageEntry], eval_every: int | None, keep: st
                 f"{starts:,} (learning_starts). Give it more steps, or start earlier"
             )
         for name, algorithm in entry.algorithms.items():
-            if budget <= (starts := algorithm.get("learning_starts", 0)):
+            beside = config_from_json(algorithm)
+            starts = algorithm.get("learning_starts", 0)
+            if budget <= starts and not is_offline(beside):
                 raise DeclarationError(
                     f"{where}: its budget is {budget:,} steps, but {name!r} begins to learn only "
                     f"after {starts:,} (learning_starts). Give the stage more steps, or start "
@@ -227,11 +229,6 @@ def check_data(entries: Sequence[StageEntry], roles: Mapping[str, Role], *, give
                 raise DeclarationError(
                     f"{who}, which learns from recorded steps: give them, data=... (a Dataset), or "
                     f"let it step the environment alone, {kind}(online=1.0, shared_replay=0.0)"
-                )
-            if decides(name):
-                raise DeclarationError(
-                    f"{who}, which is for skills and plain agents: let the selector learn by PPO, "
-                    "which begins from data, too"
                 )
             if entry.kind == "together" or entry.evolution is not None:
                 how = "a population" if entry.evolution else "skills that learn together"
