@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave._internal.paths import decides, is_below, level_of
+from skillweave.algorithms.config import config_from_json, is_offline
 from skillweave.api.applying import D, apply_manifest, differences
 from skillweave.errors import RunError
 from skillweave.evolution.evolving import Evolve, plan
@@ -187,6 +188,8 @@ def _check_grows(run: RunDirectory, entry: StageEntry, more: int) -> None:
     for learner, config in _algorithms(entry).items():
         waits = config.get("learning_starts", 0)
         place = "learner." + (f"{learner}." if entry.together else "") + "store."
+        if is_offline(config_from_json(config)):
+            continue  # it waits for nothing
         if left <= waits and not any(tensor.startswith(place) for tensor in tensors):
             raise RunError(
                 f"{run.path}: {learner!r} would learn nothing in {left:,} more steps, as its "

@@ -126,7 +126,12 @@ class Agents:
 
     def _data_steps(self) -> int:
         """Return the steps of the stage that are gradient steps on data alone."""
-        return data_steps_of(self.stage.config, self.entry.budget)
+        entry: StageEntry = self.entry
+        config: Any = self.stage.config
+        steps_it = bool(getattr(config, "online", 1.0))
+        if entry.continued and steps_it:
+            return data_steps_of(config, entry.continued[0])  # more steps are in the environment
+        return data_steps_of(config, entry.budget)
 
     def _config(self, name: str) -> Any:
         """Return a learner's settings, with the networks that it has grown in a population."""

@@ -249,8 +249,7 @@ def check_room(entries: Sequence[StageEntry], slots: int) -> None:
     """
     for entry in entries:
         config: Any = config_from_json(entry.algorithm)
-        alone = getattr(config, "online", 1.0) == 0.0
-        if not getattr(config, "shared_replay", 0.0) or alone:
+        if not getattr(config, "shared_replay", 0.0) or _steps_nothing(entry):
             continue
         size, all_steps = config.buffer_size, slots + entry.budget
         if size < slots + 2 * config.num_envs:
@@ -311,8 +310,8 @@ def assign_workers(entries: Sequence[StageEntry], spec: EnvSpec, sent: Any = Non
         DeclarationError: a declared number does not divide ``num_envs``, or a population whose
             members learn on a GPU is to be split.
     """
-    alone = any(entry.evolution is None for entry in entries)
-    workers = workers_for(spec) if alone else 1
+    measured = any(entry.evolution is None and not _steps_nothing(entry) for entry in entries)
+    workers = workers_for(spec) if measured else 1
     if workers > 1 and spec.workers is None:
         reason = why_no_processes() or runs_again() or cannot_be_sent((spec, sent))
         if reason:
@@ -341,6 +340,11 @@ def assign_workers(entries: Sequence[StageEntry], spec: EnvSpec, sent: Any = Non
             )
         else:
             entry.workers = workers
+
+
+def _steps_nothing(entry: StageEntry) -> bool:
+    """Return whether a stage learns from data alone."""
+    return getattr(config_from_json(entry.algorithm), "online", 1.0) == 0.0
 
 
 def workers_of(entry: StageEntry, requested: int) -> int:
@@ -372,7 +376,8 @@ def check_replay(entry: StageEntry, role: Role) -> None:
     try:  # unwritten slots take no memory
         judge = judge_of(config, role)
         store_of(algorithm, config.num_envs * members, members, shared=members > 1, judge=judge)
-        if judge is not None:
+        recorded = role.kind == "agent" and _steps_nothing(entry)  # so are its rewards
+        if judge is not None and not recorded:
             try_judge(judge, config, role.spec)
     except SkillweaveError as error:
         raise reworded(error, f"stage {entry.name!r}: {error}") from error
