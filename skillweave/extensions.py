@@ -40,7 +40,7 @@ SHIPPED: Mapping[str, Mapping[str, str]] = {
         "import-agilerl": "skillweave.compat.commands:IMPORT_AGILERL",
     },
     "reader": {"onnx": "skillweave.skills.onnx_file:from_onnx"},
-    "section": {},
+    "section": {"cuts": "skillweave.data.cuts_section:section"},
     "stage": {"repair": "skillweave.repair.repair_stage:REPAIR"},
 }
 """By kind and name: the module, and what it defines.

@@ -14,7 +14,7 @@ EXTENSIONS: dict[str, set[str]] = {
     "demo": {"recipes"},
     "compat": set(),
     "robots": set(),
-    "data": set(),
+    "data": {"html_report"},
 }
 """What each extension may import beside the core: the extensions that it stands on."""
 

@@ -88,13 +88,13 @@ print(*lacks)
 """
 LACKS = {
     "planning": "function.explore function.plan command.plan",
-    "html_report": "function.report command.report command.compare",
+    "html_report": "function.report command.report command.compare section.cuts",
     "repair": "function.repair function.repairs stage.repair",
     "recipes": "command.demo",
     "demo": "command.demo",
     "compat": "command.import-agilerl",
     "robots": "command.handover command.inputs",
-    "data": "function.begin function.segment",
+    "data": "function.begin function.segment section.cuts",
 }
 
 

@@ -20,7 +20,6 @@ from skillweave.api.applying import D, Trained, apply_manifest, differences
 from skillweave.api.continuing import continuable_run, continue_run
 from skillweave.api.starting import starts
 from skillweave.api.train_options import TrainOptions
-from skillweave.buffers.recorded_steps import RecordedSteps
 from skillweave.calls.recorder import check_size
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, Interrupted, RunError
@@ -32,7 +31,8 @@ from skillweave.hierarchy.roles import Level, roles_of
 from skillweave.ops.device import normal_tensors
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import called_by, resume_words, saved_words
-from skillweave.runs.directory import First, RunDirectory
+from skillweave.runs.directory import CUTS, First, RunDirectory
+from skillweave.runs.files import write_json
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.initial_policies import Learnt, copy_initial_policies
 from skillweave.runs.manifest import Manifest, identity
@@ -122,23 +122,23 @@ def start_run(
         if start_from is None and content.hierarchy is not None and declared._starts is not None:
             start_from = declared._starts()
         check_data(content.stages, roles, given=options.data is not None)
-        recorded: RecordedSteps | None = None
+        data: Any = None
         if options.data is not None:
-            cloned, recorded, says = fetch("begin")(declared, content, roles, options.data)
+            data = fetch("begin")(declared, content, roles, options.data)
             named = start_from if isinstance(start_from, Mapping) else {}
-            if cloned and start_from is not None and named is not start_from:
+            if data.learnt and start_from is not None and named is not start_from:
                 raise DeclarationError(
                     "data and start_from are given: name the learners that start from a run, "
                     'start_from={"open": run}; the others begin from the data'
                 )
-            if cloned:
-                start_from = {**cloned, **named}
-            note = "; ".join(filter(None, (note, says)))
-        if recorded is not None:
-            content = replace(content, data=recorded.name)
-            check_room(content.stages, recorded.slots)
+            if data.learnt:
+                start_from = {**data.learnt, **named}
+            note = "; ".join(filter(None, (note, data.note)))
+            if data.steps is not None:
+                content = replace(content, data=data.steps.name)
+                check_room(content.stages, data.steps.slots)
         learnt, origin = starts(content, start_from, roles) if repair is None else ({}, "")
-        first = repair or partial(_first_files, learnt=learnt, recorded=recorded)
+        first = repair or partial(_first_files, learnt=learnt, data=data)
         note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))
         make_trackers(options.track, None)  # a missing extra is reported before anything is written
         if options.cluster is not None:
@@ -153,13 +153,13 @@ def start_run(
         return train_stages(declared, run, options, note, done)
 
 
-def _first_files(
-    run: RunDirectory, learnt: Mapping[str, Learnt], recorded: RecordedSteps | None
-) -> None:
-    """Write the files that a new run begins with: initial policies, and recorded steps."""
+def _first_files(run: RunDirectory, learnt: Mapping[str, Learnt], data: Any) -> None:
+    """Write the files that a new run begins with: initial policies, and what is of its data."""
     copy_initial_policies(run, learnt)
-    if recorded is not None:
-        run.save_data(recorded.tensors())
+    if data is not None and data.steps is not None:
+        run.save_data(data.steps.tensors())
+    if data is not None and data.cuts is not None:
+        write_json(run.path / CUTS, data.cuts)
 
 
 def _kept_by_populations(content: Manifest) -> str:

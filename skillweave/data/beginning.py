@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from skillweave.buffers.recorded_steps import MASK, RecordedSteps
 from skillweave.data.cloning import Clone, clone
 from skillweave.data.dataset import Dataset
 from skillweave.data.segmenting import Segments, segment
+from skillweave.data.timeline import Cuts
 from skillweave.envs.make import make_engine
 from skillweave.errors import DeclarationError
 from skillweave.experience.views import learner_obs, own_actions
@@ -37,9 +39,21 @@ DIFFERENT = 0.01
 """The share of steps whose rewards may differ when they are computed again."""
 
 
-def begin(
-    declared: Any, content: Manifest, roles: Mapping[str, Role], data: Any
-) -> tuple[dict[str, Learnt], RecordedSteps | None, str]:
+@dataclass(frozen=True)
+class Beginning:
+    """What a run begins with."""
+
+    learnt: dict[str, Learnt]
+    """The policies from which learners start, by name."""
+    steps: RecordedSteps | None
+    """The steps from which learners with a replay learn, too; None: there is none of these."""
+    note: str
+    """A sentence about each learner."""
+    cuts: Cuts | None
+    """The calls that were found in the data; None: they were not cut."""
+
+
+def begin(declared: Any, content: Manifest, roles: Mapping[str, Role], data: Any) -> Beginning:
     """Return what learners begin with.
 
     Args:
@@ -47,10 +61,6 @@ def begin(
         content: the manifest of the new run.
         roles: of its learners, by path.
         data: a ``Dataset``, or of a hierarchy the ``Segments`` that were cut out of one.
-
-    Returns:
-        The policies from which learners start, by name; the steps from which learners with a
-        replay learn, too, None if there is none of these; and a sentence about each learner.
 
     Raises:
         DeclarationError: it is neither, or has other spaces; or no learner learns from it.
@@ -92,7 +102,8 @@ def begin(
         notes.append(f"{name} is cloned: {made}")
     if not learnt and recorded is None:
         raise DeclarationError(f"no learner begins with {episodes.name}: {'; '.join(notes)}")
-    return learnt, recorded, "; ".join(notes)
+    cuts = found.cuts() if isinstance(found, Segments) else None
+    return Beginning(learnt, recorded, "; ".join(notes), cuts)
 
 
 def _reads(config: Any, role: Role) -> bool:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
-from skillweave._internal.messages import aligned, short
+from skillweave._internal.arguments import checked_names
+from skillweave._internal.messages import aligned, as_path, short
 from skillweave._internal.notebooks import joined, paragraph, table
 from skillweave.algorithms.batches import INFO, Trace
 from skillweave.api import Hierarchy
 from skillweave.calls.log import CallLog
 from skillweave.calls.recorder import Recorder
 from skillweave.data.dataset import Dataset
+from skillweave.data.timeline import MOST, Cuts
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.hierarchy.assembly import learning_set
 from skillweave.hierarchy.fitting import ready_policies, ready_selectors
@@ -128,6 +131,39 @@ class Segments:
         }
         return Dataset(episodes, name=f"{skill} in {data.name}", **spaces)
 
+    def cuts(self) -> Cuts:
+        """Return the calls of the first episodes, for a picture."""
+        data, log = self.data, self.log
+        lengths = data.lengths[:MOST].tolist()
+        shown = self.call[: sum(lengths)]
+        starts = np.flatnonzero((shown >= 0) & (np.diff(shown, prepend=-1) != 0))
+        calls: list[list[tuple[int, int, int]]] = [[] for _ in lengths]
+        for at in starts.tolist():
+            number = int(np.searchsorted(data.offset, at, side="right")) - 1
+            call = int(shown[at])
+            begin = at - int(data.offset[number])
+            calls[number].append((int(log.skill[call]), begin, int(log.tau[call])))
+        return Cuts(data.name, len(data), list(log.skills), lengths, calls, self.sentences())
+
+    @checked_names
+    def save(self, path: str | Path) -> Path:
+        """Write a picture of the calls, a row for each of the first episodes; return its path.
+
+        Args:
+            path: ``.svg``, or ``.html`` with what the data do not show.
+
+        Raises:
+            DeclarationError: it ends otherwise.
+        """
+        path = as_path(path, "path")
+        if path.suffix not in (".svg", ".html"):
+            raise DeclarationError(
+                f"save(): path is {short(str(path))}; it must end with .svg or .html"
+            )
+        cuts = self.cuts()
+        path.write_text(cuts.svg() if path.suffix == ".svg" else cuts.html(), encoding="utf-8")
+        return path
+
     def _rows(self) -> list[list[str]]:
         log = self.log
         rows = []
@@ -141,7 +177,7 @@ class Segments:
             rows.append([name, f"{len(tau):,}", lengths, mean, share, begins])
         return rows
 
-    def _notes(self) -> list[str]:
+    def sentences(self) -> list[str]:
         """Return sentences on what the data do not show."""
         log = self.log
         notes = [f"{1 - self.claimed:.1%} of {self.data.steps:,} steps are claimed by no skill"]
@@ -164,10 +200,10 @@ class Segments:
         return notes
 
     def __str__(self) -> str:
-        return "\n".join([aligned([list(_HEAD), *self._rows()], left=1), "", *self._notes()])
+        return "\n".join([aligned([list(_HEAD), *self._rows()], left=1), "", *self.sentences()])
 
     def _repr_html_(self) -> str:
-        return joined([table(_HEAD, self._rows(), left=1), *map(paragraph, self._notes())])
+        return joined([table(_HEAD, self._rows(), left=1), *map(paragraph, self.sentences())])
 
 
 _HEAD = ("skill", "calls", "steps", "mean", "of all steps", "may start")

@@ -10,6 +10,7 @@ from skillweave._internal.messages import error_text, short
 from skillweave._internal.policy_protocol import Policy
 from skillweave.calls.log import CallLog
 from skillweave.envs.make import EnvSpec
+from skillweave.errors import MissingExtra
 from skillweave.extensions import names_of, resolve
 from skillweave.html_report.page import Page
 from skillweave.runs.directory import RunDirectory
@@ -56,6 +57,8 @@ def add_sections(page: Page, about: Reported) -> None:
             section = make(about)
             if not isinstance(section, Section | None):
                 raise TypeError(f"it must return a Section or None, not {short(section)}")
+        except MissingExtra:
+            continue  # of an own extension that is not installed, which wrote nothing either
         except Exception as error:  # of another package: the report is written in any case
             page.missing.append(f"There is no section {name!r}: {error_text(error)}.")
             continue

@@ -7,6 +7,7 @@ evaluation.json              the latest evaluation (``training/evaluation_file.p
 evaluation-sampled.json      the latest evaluation that sampled actions on request
 checkpoint.safetensors       the latest checkpoint of the stage in training (and the one before)
 calls.safetensors            calls of the skills (``calls/run_log.py``)
+cuts.json                    calls that were found in data (``data/timeline.py``)
 data.safetensors             steps from elsewhere, from which learners with a replay learn, too
 policies/<stage>.safetensors policies of finished stages
 states/<name>.safetensors    states of learners that continue in a later stage, until that is done
@@ -77,6 +78,8 @@ CALLS = "calls.safetensors"
 """The file of logged calls."""
 CALLS_LOCK = ".calls.lock"
 """The file that a process locks while it adds calls."""
+CUTS = "cuts.json"
+"""The file of calls that were found in data."""
 DATA = "data.safetensors"
 """The file of steps that were recorded elsewhere."""
 FINAL = "final"
@@ -92,7 +95,7 @@ LONGEST_NAME = 255
 MORE = 14
 """Additional characters of a file's name while it is written."""
 
-FILES = ("run.json", "metrics.jsonl", "lineage.jsonl", DATA, LOCK, TEMPORARY)
+FILES = ("run.json", "metrics.jsonl", "lineage.jsonl", DATA, CUTS, LOCK, TEMPORARY)
 """Files that training writes before the first checkpoint."""
 FOLDERS = {
     "policies": (TEMPORARY,),
