@@ -49,7 +49,7 @@ def test_a_constant_is_seen_as_one_however_large(value, masked):
 
 
 def learnt(name, batch):
-    action_space = gym.spaces.Discrete(3) if name in {"DQN", "SkillCritic"} else BOX
+    action_space = gym.spaces.Discrete(3) if name in {"DQN", "CQL", "SkillCritic"} else BOX
     settings = getattr(config, name)(normalize_obs=True)
     algorithm = make_algorithm(settings, BOX, action_space)
     state = algorithm.init([Seeds(0)])

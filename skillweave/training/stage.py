@@ -174,7 +174,7 @@ def check_stages(entries: Sequence[StageEntry], eval_every: int | None, keep: st
             raise reworded(error, f"{where}: {error}") from error
         starts = entry.algorithm.get("learning_starts", 0)
         budget = entry.budget // entry.members
-        offline = is_offline(config_from_json(entry.algorithm))
+        offline = _online(entry.algorithm) < 1.0
         if budget <= starts and not offline:
             each = " for each member" if entry.members > 1 else ""
             raise DeclarationError(
@@ -182,9 +182,8 @@ def check_stages(entries: Sequence[StageEntry], eval_every: int | None, keep: st
                 f"{starts:,} (learning_starts). Give it more steps, or start earlier"
             )
         for name, algorithm in entry.algorithms.items():
-            beside = config_from_json(algorithm)
             starts = algorithm.get("learning_starts", 0)
-            if budget <= starts and not is_offline(beside):
+            if budget <= starts and _online(algorithm) == 1.0:
                 raise DeclarationError(
                     f"{where}: its budget is {budget:,} steps, but {name!r} begins to learn only "
                     f"after {starts:,} (learning_starts). Give the stage more steps, or start "
@@ -271,7 +270,7 @@ def _check_sharing(entries: Sequence[StageEntry]) -> None:
     for entry in entries:
         if entry.shares:
             levels.setdefault(level_of(entry.name), []).append(entry)
-        offline = is_offline(config_from_json(entry.algorithm))
+        offline = _online(entry.algorithm) < 1.0
         if entry.evolution is not None and entry.algorithm.get("shared_replay") and not offline:
             raise DeclarationError(
                 f"stage {entry.name!r}: it evolves, and its algorithm has shared_replay, which is "
@@ -344,7 +343,12 @@ def assign_workers(entries: Sequence[StageEntry], spec: EnvSpec, sent: Any = Non
 
 def _steps_nothing(entry: StageEntry) -> bool:
     """Return whether a stage learns from data alone."""
-    return getattr(config_from_json(entry.algorithm), "online", 1.0) == 0.0
+    return _online(entry.algorithm) == 0.0
+
+
+def _online(algorithm: Mapping[str, Any]) -> float:
+    """Return the share of a stage's steps that are made in the environment."""
+    return float(algorithm.get("online", 1.0))
 
 
 def workers_of(entry: StageEntry, requested: int) -> int:

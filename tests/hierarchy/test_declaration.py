@@ -187,7 +187,7 @@ def test_settings_apply_in_order_and_the_skills_class_is_left_alone():
     assert d.selector.critic == dataclasses.replace(d.selector.network, hidden=(128,))
 
 
-KNOWN = "PPO, SelfImitationPPO, DQN, TD3, SAC"
+KNOWN = "PPO, SelfImitationPPO, DQN, CQL, TD3, SAC, IQL"
 WRONG_SETTINGS = {
     "call_steps": "name=value",
     "call_step=4": "call_step'.*is 'call_steps' meant",
