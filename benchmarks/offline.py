@@ -155,7 +155,7 @@ def score(name: str, seed: int, online: bool) -> dict[str, Any]:
                 lines = (Path(folder) / "run" / "metrics.jsonl").read_text().splitlines()
                 curve = [(x["steps"], x["eval_return"]) for x in map(json.loads, lines)
                          if "eval_return" in x]  # fmt: skip
-                found["start"] = max(x for x in curve if x[0] <= BUDGET)[1]
+                found["at the switch"] = max(x for x in curve if x[0] <= BUDGET)[1]
                 found["lowest"] = min(value for steps, value in curve if steps > BUDGET)
     return {"case": name, "seed": seed, **found}
 
