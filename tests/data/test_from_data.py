@@ -292,3 +292,53 @@ def test_what_a_skill_reads_and_the_data_lack_is_named(data: sw.Dataset, tmp_pat
     made = sw.Hierarchy(env, [Reads()], algorithm=sw.IQL(**ALONE), learn="apart", steps=3_000)
     with pytest.raises(DeclarationError, match=r"reads info\['heat'\].*has the keys none of info"):
         made.train(tmp_path / "run", data=data, quiet=True)
+
+
+SPACES: dict[str, Any] = {
+    "large numbers": gym.spaces.Box(0, 60_000, (3,), np.uint16),
+    "an image": gym.spaces.Box(0, 255, (12, 12, 3), np.uint8),
+    "a dict": gym.spaces.Dict(
+        place=gym.spaces.Box(-1, 1, (2,)), kind=gym.spaces.Discrete(3, start=-1)
+    ),
+    "a tuple": gym.spaces.Tuple((gym.spaces.MultiBinary(2), gym.spaces.Box(-1, 1, (1,)))),
+}
+ACTIONS: dict[str, Any] = {
+    "a range": gym.spaces.Box(np.float32([-2, 0]), np.float32([3, np.inf])),
+    "numbers": gym.spaces.Discrete(3, start=5),
+}
+
+
+@pytest.mark.parametrize("acts", ACTIONS)
+@pytest.mark.parametrize("sees", SPACES)
+def test_it_learns_from_data_of_each_kind_of_space(sees: str, acts: str, tmp_path: Path) -> None:
+    class Odd(gym.Env):
+        observation_space = SPACES[sees]
+        action_space = ACTIONS[acts]
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            return self.observation_space.sample(), {}
+
+        def step(self, action: Any) -> Any:
+            return self.observation_space.sample(), 1.0, False, True, {}
+
+    def columns(drawn: list[Any]) -> Any:
+        if isinstance(drawn[0], dict):
+            return {key: np.stack([x[key] for x in drawn]) for key in drawn[0]}
+        if isinstance(drawn[0], tuple):
+            return tuple(np.stack(part) for part in zip(*drawn, strict=True))
+        return np.stack(drawn)
+
+    env = sw.EnvSpec(Odd, engine="sync", check_seed=False)
+    episodes = [
+        {
+            "observations": columns([Odd.observation_space.sample() for _ in range(6)]),
+            "actions": columns([Odd.action_space.sample() for _ in range(5)]),
+            "rewards": np.ones(5),
+        }
+        for _ in range(8)
+    ]
+    data = sw.Dataset(episodes, env)
+    config = sw.IQL(batch_size=8, network=SMALL)
+    sw.train_agent(env, config, 100, tmp_path / "run", data=data, quiet=True)
+    more = sw.train_agent(env, config, 150, tmp_path / "run", resume=True, quiet=True)
+    assert all(w.isfinite().all() for w in more.policy.weights.values())
