@@ -117,6 +117,12 @@ def start_run(
         if options.resume and (run := continuable_run(place)) is not None:
             stack.callback(run.close)
             declared, note = continue_run(declared, content, run, options.evolve)
+            if (
+                options.data is not None
+                and getattr(options.data, "name", None) != run.manifest.data
+            ):
+                kept = f"with {run.manifest.data}" if run.manifest.data else "without further data"
+                note = "; ".join(filter(None, (note, f"the run continues as it began, {kept}")))
             return train_stages(declared, run, options, note)
         start_from = options.start_from
         if start_from is None and content.hierarchy is not None and declared._starts is not None:

@@ -69,7 +69,9 @@ class OfflineLearner(ReplayLearner):
         """Make the gradient steps that are due; return the metrics of the last one."""
         if steps > self._data_steps:
             return super().learn(update, steps, progress)
-        metrics = self._learn(0, update, progress, self._on_data)
+        # With overlap the next request is made before this one is learnt from.
+        due = round(self._transitions[1] - self._transitions[0])
+        metrics = self._learn(0, update, progress, due)
         self._transitions[0] = self._transitions[1]
         return metrics
 

@@ -15,6 +15,7 @@ from test_begin import Lift, demonstrator, hierarchy, spec
 import skillweave as sw
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError, RunError
+from skillweave.runs.files import read_tensors
 from skillweave.training.replay_learner import judge_of, store_of
 from skillweave.training.role import agent_role
 from skillweave.types import Array
@@ -142,11 +143,12 @@ def test_skills_learn_from_steps_that_nobody_made_for_them(
     assert np.mean(run.evaluate(20).returns) > 0.9
 
 
+@pytest.mark.parametrize("overlap", [False, True])
 @pytest.mark.parametrize("online", [0.0, 0.5])
 def test_a_run_that_was_stopped_goes_on_to_the_same_weights(
-    online: float, data: sw.Dataset, tmp_path: Path
+    online: float, overlap: bool, data: sw.Dataset, tmp_path: Path
 ) -> None:
-    config = sw.IQL(**ALONE, online=online, num_envs=4)
+    config = sw.IQL(**ALONE, online=online, overlap=overlap, num_envs=4)
     how: dict[str, Any] = {"quiet": True, "checkpoint_every": 100, "eval_every": 200}
     whole = sw.train_agent(spec(), config, 600, tmp_path / "whole", data=data, **how)
     for number in (1, 4):
@@ -155,6 +157,15 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_weights(
             sw.train_agent(spec(), config, 600, place, data=data, **how)
         parts = sw.train_agent(spec(), config, 600, place, resume=True, **how)
         assert_same(parts.path, whole.path)
+
+
+def test_each_step_on_data_is_a_gradient_step(data: sw.Dataset, tmp_path: Path) -> None:
+    for overlap in (False, True):
+        config = sw.CQL(**ALONE, overlap=overlap)
+        place = tmp_path / str(overlap)
+        run = sw.train_agent(spec(), config, 130, place, data=data, quiet=True)
+        tensors, _ = read_tensors(run.path / "final" / "agent.safetensors")
+        assert int(tensors["state.agent.updates"]) == 130
 
 
 def test_a_run_with_a_share_of_data_goes_on_to_the_same_weights(
