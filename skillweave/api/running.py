@@ -117,12 +117,7 @@ def start_run(
         if options.resume and (run := continuable_run(place)) is not None:
             stack.callback(run.close)
             declared, note = continue_run(declared, content, run, options.evolve)
-            if (
-                options.data is not None
-                and getattr(options.data, "name", None) != run.manifest.data
-            ):
-                kept = f"with {run.manifest.data}" if run.manifest.data else "without further data"
-                note = "; ".join(filter(None, (note, f"the run continues as it began, {kept}")))
+            note = "; ".join(filter(None, (note, _other_data(run, options.data))))
             return train_stages(declared, run, options, note)
         start_from = options.start_from
         if start_from is None and content.hierarchy is not None and declared._starts is not None:
@@ -157,6 +152,15 @@ def start_run(
         run = RunDirectory.create(place, content, first, hold=True, overwrite=options.overwrite)
         stack.callback(run.close)
         return train_stages(declared, run, options, note, done)
+
+
+def _other_data(run: RunDirectory, data: Any) -> str:
+    """Return a sentence where a run continues with other data than those given; may be empty."""
+    kept = run.manifest.data
+    given = getattr(getattr(data, "data", data), "name", None)  # a Dataset, or Segments of one
+    if data is None or given == kept:
+        return ""
+    return f"the run continues as it began, {f'with {kept}' if kept else 'without further data'}"
 
 
 def _first_files(run: RunDirectory, learnt: Mapping[str, Learnt], data: Any) -> None:

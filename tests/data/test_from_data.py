@@ -180,13 +180,19 @@ def test_a_run_with_a_share_of_data_goes_on_to_the_same_weights(
     assert_same(parts.path, whole.path)
 
 
-def test_more_steps_learn_on_from_the_same_data(data: sw.Dataset, tmp_path: Path) -> None:
+def test_more_steps_learn_on_from_the_same_data(
+    data: sw.Dataset, tmp_path: Path, capsys: Any
+) -> None:
     config = sw.CQL(**ALONE)
     run = sw.train_agent(spec(), config, 200, tmp_path / "run", data=data, quiet=True)
     before = policies(run.path)
     more = sw.train_agent(spec(), config, 400, tmp_path / "run", resume=True, quiet=True)
     assert more.info()["stages"][0]["steps"] == 400
     assert policies(run.path) != before
+    other = data.select(range(5))
+    other.name = "others"
+    sw.train_agent(spec(), config, 500, tmp_path / "run", resume=True, data=other)
+    assert f"the run continues as it began, with {data.name}" in capsys.readouterr().err
     (run.path / "data.safetensors").unlink()
     with pytest.raises(RunError, match=r"data\.safetensors is not there any more"):
         sw.train_agent(spec(), config, 600, tmp_path / "run", resume=True, quiet=True)
