@@ -24,6 +24,7 @@ from skillweave.data.timeline import Cuts
 from skillweave.envs.make import make_engine
 from skillweave.errors import DeclarationError
 from skillweave.experience.views import learner_obs, own_actions
+from skillweave.hierarchy.roles import roles_of
 from skillweave.policies.core import Array
 from skillweave.runs.initial_policies import Learnt, options_of
 from skillweave.runs.manifest import Manifest
@@ -70,6 +71,8 @@ def begin(declared: Any, content: Manifest, roles: Mapping[str, Role], data: Any
         kinds = "a Dataset" if flat else "a Dataset, or what hierarchy.segment() returned"
         raise DeclarationError(f"data is {short(data)}; it must be {kinds}")
     episodes = data.data if isinstance(data, Segments) else data
+    if isinstance(data, Segments):
+        _check_skills(declared, data)
     episodes.check_env(declared.spec)
     settings = _first_settings(content)
     readers = [name for name, config in settings.items() if _reads(config, roles[name])]
@@ -104,6 +107,20 @@ def begin(declared: Any, content: Manifest, roles: Mapping[str, Role], data: Any
         raise DeclarationError(f"no learner begins with {episodes.name}: {'; '.join(notes)}")
     cuts = found.cuts() if isinstance(found, Segments) else None
     return Beginning(learnt, recorded, "; ".join(notes), cuts)
+
+
+def _check_skills(declared: Any, found: Segments) -> None:
+    """Raise a DeclarationError where calls were found for the skills of another hierarchy."""
+    level = roles_of(declared).levels[""]
+    skills, lengths = level.names, tuple(level.lengths)
+    log = found.log
+    if (tuple(log.skills), tuple(log.lengths)) != (skills, lengths):
+        raise DeclarationError(
+            f"data are calls of {', '.join(log.skills)}, that another hierarchy found: this one "
+            f"has {', '.join(skills)}"
+            + f" and call lengths {lengths}" * (tuple(log.skills) == skills)
+            + ". Let it find its own, hierarchy.segment(found.data)"
+        )
 
 
 def _reads(config: Any, role: Role) -> bool:

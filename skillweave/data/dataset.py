@@ -24,6 +24,15 @@ from skillweave.spaces import obs_dtype, pack, same_space
 KEYS = ("observations", "actions", "rewards", "terminations", "truncations", "infos")
 """The parts of an episode, by Minari's names."""
 ENDS = ("terminated", "truncated", "neither")
+MEANT = {
+    **dict.fromkeys(("obs", "observation", "states", "state"), "observations"),
+    **dict.fromkeys(("action", "acts"), "actions"),
+    **dict.fromkeys(("reward", "rews"), "rewards"),
+    **dict.fromkeys(("terminated", "terminals", "dones", "done"), "terminations"),
+    **dict.fromkeys(("truncated", "timeouts"), "truncations"),
+    "info": "infos",
+}
+"""Names that other programs use for the parts of an episode."""
 
 
 class Dataset:
@@ -45,7 +54,8 @@ class Dataset:
     ```
 
     An episode has Minari's names. Observations of a Dict or Tuple are dicts and tuples of arrays.
-    ``infos`` are arrays by key, one value for each step, or for each observation. Without a last
+    ``infos`` are arrays by key, one value for each step, or for each observation; or a list of
+    dicts, as ``env.step`` returns them. Without a last
     observation, (T, ...), a step that ends nothing is left out, as what it led to is unknown.
 
     Args:
@@ -104,6 +114,11 @@ class Dataset:
                 "Dataset needs the spaces of its observations and actions: give env, or "
                 "observation_space and action_space"
             )
+        if isinstance(episodes, Mapping) or not isinstance(episodes, Iterable):
+            raise DeclarationError(
+                f"Dataset(): episodes is {short(episodes)}; it must be a list of episodes, each a "
+                f"mapping with {', '.join(KEYS)}"
+            )
         self.name = name
         self.observation_space = observation_space
         self.action_space = action_space
@@ -129,6 +144,10 @@ class Dataset:
             log: of calls.
             name: for messages and reports.
         """
+        if not isinstance(log, CallLog):
+            raise DeclarationError(
+                f"from_log(): log is {short(log)}; it must be a log of calls, run.calls"
+            )
         episodes = []
         for calls in _joined_calls(log):
             rows = np.concatenate([np.arange(log.offset[c], log.offset[c + 1]) for c in calls])
@@ -218,7 +237,15 @@ class Dataset:
 
         Args:
             number: from 0.
+
+        Raises:
+            DeclarationError: there is no such episode.
         """
+        whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
+        if not whole or not 0 <= number < len(self):
+            raise DeclarationError(
+                f"episode(): number is {short(number)}; it must be from 0 to {len(self) - 1}"
+            )
         rows = slice(int(self.offset[number]), int(self.offset[number + 1]))
         obs = self.obs[rows]
         if self.whole[number]:
@@ -372,6 +399,11 @@ class _EpisodeReader:
             raise DeclarationError(
                 f"{who} is {short(given)}; it must be a mapping with {', '.join(KEYS)}"
             )
+        for key, name in MEANT.items():
+            if key in given and name not in given:
+                raise DeclarationError(
+                    f"{who} has {key!r}, which is not read: call it {name!r} (Minari's name)"
+                )
         actions = self._packed(self._action, given["actions"], f"{who}: actions")
         steps = len(actions)
         seen = self._packed(self._observation, given["observations"], f"{who}: observations")
@@ -392,7 +424,7 @@ class _EpisodeReader:
                 f"{who} ends at step {step} (terminations, truncations), but has {steps} steps: "
                 "split it there"
             )
-        if not (inside := self._actions.holds(actions)).all():
+        if steps and not (inside := self._actions.holds(actions)).all():
             step = int(np.flatnonzero(~inside)[0])
             raise DeclarationError(
                 f"{who}: its action of step {step} is {short(actions[step].tolist())}, which is "
@@ -446,9 +478,13 @@ class _EpisodeReader:
         if value is None:
             return np.zeros(steps, kind)
         try:
-            found = np.asarray(value).astype(kind).reshape(-1)
-        except (TypeError, ValueError) as error:
+            numbers = np.asarray(value)
+        except ValueError as error:
             raise DeclarationError(f"{who}: {key} are no numbers: {str(error)[:200]}") from error
+        if numbers.dtype.kind not in "biuf" and numbers.size:
+            raise DeclarationError(f"{who}: {key} are no numbers: {short(value)}")
+        with np.errstate(over="ignore"):  # what becomes infinite is refused
+            found = numbers.astype(kind).reshape(-1)
         if len(found) != steps:
             raise DeclarationError(f"{who} has {len(found)} {key} for {steps} actions")
         return found
@@ -456,8 +492,11 @@ class _EpisodeReader:
     def _infos(self, given: Any, steps: int, keep: slice, who: str) -> dict[str, Array]:
         """Return the numbers in infos, by key; what is no number is left out."""
         found: dict[str, Array] = {}
+        if isinstance(given, Sequence) and all(isinstance(one, Mapping) for one in given):
+            keys = [key for key in given[0] if all(key in one for one in given)] if given else []
+            given = {key: [one[key] for one in given] for key in keys}
         for key, value in given.items() if isinstance(given, Mapping) else ():
-            numbers = None if isinstance(value, Mapping) else np.asarray(value)
+            numbers = _numbers(value)
             if numbers is None or numbers.dtype.kind not in "biuf" or not numbers.ndim:
                 continue
             if len(numbers) not in (steps, steps + 1):
@@ -466,6 +505,16 @@ class _EpisodeReader:
                 )
             found[str(key)] = numbers[len(numbers) - steps :][keep]
         return found
+
+
+def _numbers(value: Any) -> Array | None:
+    """Return what is in infos as an array; None: it is none."""
+    if isinstance(value, Mapping):
+        return None
+    try:
+        return np.asarray(value)
+    except ValueError:  # of different lengths
+        return None
 
 
 def _cast(x: Array, kind: np.dtype[Any]) -> Array:

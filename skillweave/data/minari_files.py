@@ -9,7 +9,7 @@ import numpy as np
 
 from skillweave._internal.messages import short
 from skillweave.buffers.ram import check_memory
-from skillweave.errors import RunError, needs_extra
+from skillweave.errors import DeclarationError, RunError, needs_extra
 from skillweave.spaces import obs_dtype, obs_shape, unpack
 
 
@@ -30,6 +30,11 @@ def read_minari(source: Any) -> dict[str, Any]:
                 f"Minari cannot load {short(source)}: {str(error)[:300]}. Download it first: "
                 f"minari.download_dataset({source!r})"
             ) from error
+    if not hasattr(found, "iterate_episodes"):
+        raise DeclarationError(
+            f"from_minari(): source is {short(source)}; it must be the id of a data set, or what "
+            "minari.load_dataset() returned"
+        )
     space = found.spec.observation_space
     each = 2 * obs_dtype(space).itemsize * int(np.prod(obs_shape(space), dtype=np.int64))
     what = f"the data set {found.spec.dataset_id}"

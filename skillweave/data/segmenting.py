@@ -23,6 +23,7 @@ from skillweave.hierarchy.assembly import learning_set
 from skillweave.hierarchy.fitting import ready_policies, ready_selectors
 from skillweave.hierarchy.roles import roles_of
 from skillweave.policies.core import EPISODE, LIMIT, OWN, RUNNING, Array, Step, part_of, read_only
+from skillweave.runs.files import write_bytes
 from skillweave.schema import AtLeastOne, fitted
 from skillweave.skills import Skill, call_method
 from skillweave.skills.base import path_of
@@ -154,6 +155,7 @@ class Segments:
 
         Raises:
             DeclarationError: it ends otherwise.
+            RunError: it cannot be written.
         """
         path = as_path(path, "path")
         if path.suffix not in (".svg", ".html"):
@@ -161,7 +163,7 @@ class Segments:
                 f"save(): path is {short(str(path))}; it must end with .svg or .html"
             )
         cuts = self.cuts()
-        path.write_text(cuts.svg() if path.suffix == ".svg" else cuts.html(), encoding="utf-8")
+        write_bytes(path, (cuts.svg() if path.suffix == ".svg" else cuts.html()).encode())
         return path
 
     def _rows(self) -> list[list[str]]:

@@ -20,6 +20,7 @@ from skillweave.errors import DeclarationError
 from skillweave.policies.core import Array
 from skillweave.robots.counts import exact_chance
 from skillweave.robots.picture import matrix_svg, page
+from skillweave.runs.files import write_bytes
 
 SHOWN = 12
 """The most pairs in the list of a text."""
@@ -302,6 +303,7 @@ class HandoverTable:
 
         Raises:
             DeclarationError: it ends otherwise.
+            RunError: it cannot be written.
         """
         path = as_path(path, "path")
         check_suffix(path)
@@ -311,7 +313,7 @@ class HandoverTable:
             content = self._picture()
         else:
             content = page(self._title(), self._picture(), self._list(), self.sentences())
-        path.write_text(content, encoding="utf-8")
+        write_bytes(path, content.encode())
         return path
 
     def __str__(self) -> str:

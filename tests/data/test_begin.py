@@ -233,3 +233,11 @@ def test_a_clone_is_judged_by_rows_that_it_has_not_seen(numbers: bool, few: bool
         assert (given == action).mean() > 0.95
         assert made.agrees is not None
         assert made.agrees > 0.9
+
+
+def test_calls_of_another_hierarchy_are_refused(data: sw.Dataset, tmp_path: Path) -> None:
+    found = hierarchy().segment(data)
+    ppo = sw.PPO(num_envs=4, n_steps=32)
+    other = sw.Hierarchy(spec(), [Reach(), Raise()], algorithm=ppo, selector=ppo, steps=256)
+    with pytest.raises(DeclarationError, match=r"reach, grip, raise, that another hierarchy found"):
+        other.train(tmp_path / "run", data=found, quiet=True)

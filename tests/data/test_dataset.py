@@ -300,3 +300,54 @@ def test_a_skill_that_is_done_where_it_starts_is_noticed() -> None:
     for wrong in ({"shortest": 0}, {"goals": {"up": lean}}, {"data": 5}):
         with pytest.raises(DeclarationError, match=r"segment\(\): |goals names"):
             made.segment(**{"data": data} | wrong)
+
+
+LINE = gym.spaces.Box(-1, 1, (2,))
+PLAIN: dict[str, Any] = {
+    "observations": np.zeros((4, 2)), "actions": [0, 1, 1], "rewards": [1, 1, 1],
+}  # fmt: skip
+
+
+def plain(episodes: Any) -> sw.Dataset:
+    return sw.Dataset(episodes, observation_space=LINE, action_space=gym.spaces.Discrete(2))
+
+
+UNTIDY: dict[str, tuple[Any, str]] = {
+    "one episode": (lambda: plain(PLAIN), "it must be a list of episodes, each a mapping"),
+    "nothing": (lambda: plain(None), "Dataset.*episodes is None"),
+    "a number": (lambda: plain(3), "episodes is 3"),
+    "D4RL's names": (
+        lambda: plain([{**PLAIN, "terminals": [0, 0, 1]}]),
+        "has 'terminals', which is not read: call it 'terminations'",
+    ),
+    "Gym's names": (lambda: plain([{**PLAIN, "dones": [0, 0, 1]}]), "has 'dones'"),
+    "ends as texts": (
+        lambda: plain([{**PLAIN, "terminations": ["False", "False", "True"]}]),
+        "terminations are no numbers",
+    ),
+    "a large reward": (lambda: plain([{**PLAIN, "rewards": [1e300, 1, 1]}]), "step 0 is inf"),
+    "no step": (
+        lambda: plain([{"observations": np.zeros((1, 2)), "actions": [], "rewards": []}]),
+        "has no episode with a step",
+    ),
+    "no log": (lambda: sw.Dataset.from_log(5), "log is 5; it must be a log of calls"),
+    "no such episode": (lambda: plain([PLAIN]).episode(9), "number is 9; it must be from 0 to 0"),
+}
+
+
+@pytest.mark.parametrize("mistake", UNTIDY)
+def test_untidy_episodes_are_named(mistake: str) -> None:
+    make, says = UNTIDY[mistake]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(DeclarationError, match=says):
+            make()
+
+
+def test_infos_may_be_what_steps_returned() -> None:
+    infos = [{"x": 1.0, "name": "a", "own": [1]}, {"x": 2.0, "own": [1, 2]}, {"x": 3.0, "own": []}]
+    data = plain([{**PLAIN, "infos": infos}])
+    assert data.info.keys() == {"x"}
+    assert data.info["x"].tolist() == [1.0, 2.0, 3.0]
+    with_first = plain([{**PLAIN, "infos": [{"x": 9.0}, *infos]}])
+    assert with_first.info["x"].tolist() == [1.0, 2.0, 3.0]
