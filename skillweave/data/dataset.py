@@ -143,6 +143,9 @@ class Dataset:
         Args:
             log: of calls.
             name: for messages and reports.
+
+        Raises:
+            DeclarationError: it is no log.
         """
         if not isinstance(log, CallLog):
             raise DeclarationError(
