@@ -137,7 +137,7 @@ def start_run(
             note = "; ".join(filter(None, (note, data.note)))
             if data.steps is not None:
                 content = replace(content, data=data.steps.name)
-                check_room(content.stages, data.steps.slots)
+                check_room(content.stages, data.steps.room)
         learnt, origin = starts(content, start_from, roles) if repair is None else ({}, "")
         first = repair or partial(_first_files, learnt=learnt, data=data)
         note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))

@@ -39,10 +39,14 @@ class RecordedSteps:
     def __len__(self) -> int:
         return len(self.reward)
 
-    @property
-    def slots(self) -> int:
-        """The room that the steps need in a store: an episode's end takes that of a step."""
-        return len(self) + int(self.last.sum())
+    def room(self, num_envs: int) -> int:
+        """Return the capacity that a store of ``num_envs`` columns needs for the steps.
+
+        All columns are as long as the longest, in which an episode's end takes the place of a step.
+        """
+        height = -(-len(self) // num_envs)
+        ends = np.add.reduceat(self.last, np.arange(0, len(self), height), dtype=np.int64)
+        return num_envs * (height + int(ends.max()) + 2)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the steps as tensors, for a file."""

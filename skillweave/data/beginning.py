@@ -149,7 +149,7 @@ def _readable(config: Any, role: Role, steps: RecordedSteps, data: Dataset) -> s
             f"info[{MASK!r}]: values would be learnt of actions that were not allowed"
         )
     algorithm: Any = make_algorithm(config, *role.spaces)
-    store = store_of(algorithm, 1, judge=judge, capacity=steps.slots + 2)
+    store = store_of(algorithm, 1, judge=judge, capacity=steps.room(1))
     assert isinstance(store, JudgedStore)
     rng = (Seeds(0) / "data").numpy()
     rows = store.add_recorded(steps.rows(1, store.raw), rng)

@@ -226,7 +226,7 @@ class Agents:
         data = self._data() if judge is not None and algorithm.config.shared_replay else None
         capacity = None
         if data is not None and data_steps == self.entry.budget:
-            capacity = data.slots + 2 * self.entry.num_envs  # it holds nothing else
+            capacity = data.room(self.entry.num_envs)  # it holds nothing else
         learner = learner_of(
             Stack(algorithm, state_to(state, device)),
             self.entry.num_envs,

@@ -237,11 +237,11 @@ def check_data(entries: Sequence[StageEntry], roles: Mapping[str, Role], *, give
                 )
 
 
-def check_room(entries: Sequence[StageEntry], slots: int) -> None:
+def check_room(entries: Sequence[StageEntry], room: Callable[[int], int]) -> None:
     """Check that replay buffers have the room for data.
 
     Args:
-        slots: the room that the data need in a buffer.
+        room: returns the room that the data need in a buffer, given the number of environments.
 
     Raises:
         DeclarationError: a buffer is smaller.
@@ -250,8 +250,9 @@ def check_room(entries: Sequence[StageEntry], slots: int) -> None:
         config: Any = config_from_json(entry.algorithm)
         if not getattr(config, "shared_replay", 0.0) or _steps_nothing(entry):
             continue
+        slots = room(config.num_envs)
         size, all_steps = config.buffer_size, slots + entry.budget
-        if size < slots + 2 * config.num_envs:
+        if size < slots:
             raise DeclarationError(
                 f"stage {entry.name!r}: buffer_size is {size:,}, but the data take {slots:,} of "
                 f"its places: give buffer_size={all_steps:,}, for the data and the stage's steps"

@@ -67,12 +67,14 @@ def numbered(lengths: list[int]) -> sw.Dataset:
 
 @pytest.mark.parametrize("num_envs", [1, 3, 8])
 def test_a_store_draws_each_recorded_step_as_it_was(num_envs: int) -> None:
-    data = numbered([4, 1, 7, 2, 30, 1, 1])
+    data = numbered([4, 1, 7, 2, 30, *[1] * 17])
     config = sw.SAC(**OFF | {"num_envs": num_envs}, shared_replay=0.5)
     role = agent_role(sw.EnvSpec(Counted, check_seed=False))
     algorithm = make_algorithm(config, *role.spaces)
-    store: Any = store_of(algorithm, num_envs, judge=judge_of(config, role))
     steps = data.recorded()
+    store: Any = store_of(
+        algorithm, num_envs, judge=judge_of(config, role), capacity=steps.room(num_envs)
+    )
     store.add_recorded(steps.rows(num_envs, store.raw), np.random.default_rng(0))
     assert len(store) == data.steps
     drawn = store.sample(2_000, torch.tensor([0.9]), [np.random.default_rng(1)])
