@@ -223,14 +223,16 @@ class Agent(Trainable, PlainAgent):
             start_from: another run, or its directory: a learner that has learnt there, by the same
                 name, starts with its policy. Or several runs, by learner: ``{"left": run,
                 "right": other}``; a run of a plain agent fits any name. The policy is copied (of
-                PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
-                spaces, networks and the names of a selector's skills must be the same. In place of
-                a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
+                PPO, DQN and CQL all networks, of SAC and TD3 the actor, of IQL also the values of
+                states). The task may be another one; spaces, networks and the names of a selector's
+                skills must be the same. In place of a run also ``from_sb3(..., learn=True)`` or
+                ``from_torch``'s.
             data: a ``Dataset`` of episodes to begin from; of a hierarchy also what ``segment`` has
                 cut out of one. An agent that learns by PPO is cloned from the episodes (behavioural
                 cloning); skills from their calls, the selector from the choices. Then all learn on.
-                A part of the episodes is held out, and judges the clones. Learners by other
-                algorithms begin with nothing. Not where a run continues.
+                A part of the episodes is held out, and judges the clones. IQL and CQL learn from
+                the steps alone, and SAC, TD3 and DQN with ``shared_replay`` from a share of them in
+                each batch; the run keeps a copy. Not where a run continues.
 
         Returns:
             The finished run.
@@ -440,14 +442,16 @@ class Hierarchy(Trainable, Declaration):
             start_from: another run, or its directory: a learner that has learnt there, by the same
                 name, starts with its policy. Or several runs, by learner: ``{"left": run,
                 "right": other}``; a run of a plain agent fits any name. The policy is copied (of
-                PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
-                spaces, networks and the names of a selector's skills must be the same. In place of
-                a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
+                PPO, DQN and CQL all networks, of SAC and TD3 the actor, of IQL also the values of
+                states). The task may be another one; spaces, networks and the names of a selector's
+                skills must be the same. In place of a run also ``from_sb3(..., learn=True)`` or
+                ``from_torch``'s.
             data: a ``Dataset`` of episodes to begin from; of a hierarchy also what ``segment`` has
                 cut out of one. An agent that learns by PPO is cloned from the episodes (behavioural
                 cloning); skills from their calls, the selector from the choices. Then all learn on.
-                A part of the episodes is held out, and judges the clones. Learners by other
-                algorithms begin with nothing. Not where a run continues.
+                A part of the episodes is held out, and judges the clones. IQL and CQL learn from
+                the steps alone, and SAC, TD3 and DQN with ``shared_replay`` from a share of them in
+                each batch; the run keeps a copy. Not where a run continues.
             flat: train one plain agent for the same number of steps instead: the baseline. True:
                 with the settings of ``train_defaults``; or its settings.
 
@@ -1297,14 +1301,16 @@ def train_agent(
         start_from: another run, or its directory: a learner that has learnt there, by the same
             name, starts with its policy. Or several runs, by learner: ``{"left": run,
             "right": other}``; a run of a plain agent fits any name. The policy is copied (of
-            PPO and DQN all networks, of SAC and TD3 the actor). The task may be another one;
-            spaces, networks and the names of a selector's skills must be the same. In place of
-            a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
+            PPO, DQN and CQL all networks, of SAC and TD3 the actor, of IQL also the values of
+            states). The task may be another one; spaces, networks and the names of a selector's
+            skills must be the same. In place of a run also ``from_sb3(..., learn=True)`` or
+            ``from_torch``'s.
         data: a ``Dataset`` of episodes to begin from; of a hierarchy also what ``segment`` has
             cut out of one. An agent that learns by PPO is cloned from the episodes (behavioural
             cloning); skills from their calls, the selector from the choices. Then all learn on.
-            A part of the episodes is held out, and judges the clones. Learners by other
-            algorithms begin with nothing. Not where a run continues.
+            A part of the episodes is held out, and judges the clones. IQL and CQL learn from
+            the steps alone, and SAC, TD3 and DQN with ``shared_replay`` from a share of them in
+            each batch; the run keeps a copy. Not where a run continues.
         target_return: stop early at this mean return of the periodic evaluation.
         target_success: stop early at this share of episodes with a true ``info["success"]``, or
             ``info["is_success"]`` where that is missing.
