@@ -55,7 +55,7 @@ class Balance(Skill):
 
 small = PPO(num_envs=4, n_steps=8, batch_size=16, update_epochs=2, network=Network(hidden=(8,)))
 moving = PPO(
-    num_envs=4, n_steps=8, batch_size=32, update_epochs=1, network=Network((6,)), overlap=False,
+    num_envs=4, n_steps=8, batch_size=32, update_epochs=2, network=Network((6,)), overlap=False,
     normalize_obs=True, learning_rate_schedule="kl", target_kl=0.01, critic=Network(hidden=(5, 5)),
 )
 Left.algorithm = moving

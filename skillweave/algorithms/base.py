@@ -377,18 +377,23 @@ class Algorithm:
         adam_(state.params, grad, *moments, rate, eps=eps, active=active)
         return norm
 
-    def update_obs_stats(self, state: Any, obs: Tensor, valid: Tensor | None = None) -> None:
-        """Update the running moments of observations, in place.
+    def update_obs_stats(
+        self, state: Any, obs: Tensor, valid: Tensor | None = None, *, scales: bool = True
+    ) -> None:
+        """Update the running moments and the range of observations, in place.
 
         Args:
             state: of P members.
             obs: (P, B, *item), raw.
             valid: (P, B) bool, rows that count; None: all.
+            scales: False: the moments stay, and with them how observations are scaled.
         """
         if self.normalize_obs:
-            moments = state.obs_mean, state.obs_var, state.obs_count
             vector, _ = self.obs.split(obs)
-            state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, vector, valid)
+            if scales:
+                state.obs_mean, state.obs_var, state.obs_count = merge_moments(
+                    state.obs_mean, state.obs_var, state.obs_count, vector, valid
+                )
             if valid is not None:
                 vector = torch.where(valid[..., None], vector, state.obs_mean[:, None])
             state.obs_low = state.obs_low.minimum(vector.amin(1))

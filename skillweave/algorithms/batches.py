@@ -283,6 +283,8 @@ class Rollout:
     env_reward: Tensor | None = None  # (P, T, B), the environment's own, where it is needed
     reference: Reference | None = None  # the policy that the learner stays near
     rehearsal: Rehearsal | None = None  # observations in which it keeps what it did
+    keeps_scaling: bool = False  # observations stay scaled as for the policy that was given
+    critic_alone: bool = False  # the policy stays as it is, while its critic learns
     progress: float = 0.0  # share of the budget that is spent, for schedules
 
 

@@ -86,8 +86,10 @@ class PPO(OnPolicy):
     update_epochs: Amount = 5
     """Passes over each rollout."""
     learning_rate_schedule: Literal["constant", "linear", "kl"] = "linear"
-    """constant; linear: falls to 0 over the budget; kl: follows target_kl. Counts where
-    ``learning_rate`` is a number."""
+    """constant; linear: falls to 0 over the budget; kl: begins at ``learning_rate``, and follows
+    target_kl: after each minibatch it is divided by 1.5 where the update has a KL above twice the
+    target, and multiplied below half of it, to at most ten times ``learning_rate``. Where a policy
+    was given, see ``learning_on``. Counts where ``learning_rate`` is a number."""
     adam_eps: Positive = 1e-5
     """Adam's ε."""
     gae_lambda: Fraction = 0.95
@@ -149,6 +151,26 @@ class PPO(OnPolicy):
     def minibatch(self) -> int:
         """The approximate samples of a gradient step."""
         return self.batch_size or max(64, self.num_envs * self.n_steps // 8)
+
+    def learning_on(self, *, continuous: bool) -> PPO:
+        """Return the settings by which a learner goes on from a policy that was given.
+
+        A policy that can do something is kept by small steps: the learning rate begins at 1e-4 and
+        follows a KL of 0.01, and no bonus widens continuous actions. A setting that is not its
+        default stays; ``learning_rate=Linear(3e-3, 0)`` is the usual rate.
+
+        Args:
+            continuous: some numbers of an action are continuous.
+        """
+        usual = type(self)()
+        changes: dict[str, Any] = {}
+        rate = self.learning_rate, self.learning_rate_schedule
+        if rate == (usual.learning_rate, usual.learning_rate_schedule):
+            target = 0.01 if self.target_kl is None else self.target_kl
+            changes = {"learning_rate": 1e-4, "learning_rate_schedule": "kl", "target_kl": target}
+        if continuous and self.ent_coef == usual.ent_coef and self.ent_coef_final is None:
+            changes["ent_coef"] = 0.0
+        return replace(self, **changes)
 
 
 @settings

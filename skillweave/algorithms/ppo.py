@@ -40,7 +40,15 @@ REHEARSAL_COST = 0.2
 OPENNESS = 0.1
 """Cost of a nat of KL from uniform choices, times epsilon: the least likely of n choices keeps a
 probability near 0.1·ε/n, where advantages have a deviation of 1, and can be learnt again."""
-_LR_RANGE = (1e-5, 1e-2)  # of the schedule 'kl', as in rl_games
+LEAST_RATE, LARGEST_RATE = 1e-5, 1e-2
+"""Bounds of the schedule 'kl', as in rl_games."""
+RISE = 10.0
+"""The most by which the schedule 'kl' raises the rate that it begins with."""
+FARTHEST, FARTHEST_BY_KL = 1.5, 4.0
+"""The KL at which an update stops, in units of ``target_kl``: 1.5 as in Stable-Baselines3; the
+schedule 'kl' lowers the rate at 2, and stops where that was too late."""
+CRITIC_RATE = 1e-3
+"""Adam's step size while the critic learns alone and the rate follows the KL, which is 0 then."""
 
 
 @dataclass
@@ -160,9 +168,11 @@ class PPOAlgorithm(Algorithm):
         cfg = self.config
         terms = Terms.of(cfg, state, batch)
         samples, metrics = self.samples(state, batch, terms)
+        follows_kl = cfg.learning_rate_schedule == "kl" and not terms.critic_alone
         rate = terms.rate
         count = samples.count
         limited = self._kl_limit is not None
+        target = torch.full_like(rate, cfg.target_kl or 0.0)
         reports: list[dict[str, Tensor]] = []  # of gradient steps
         learnt: list[Tensor] = []  # (P,) bool each, the members that took part
         compiles = cfg.compile and not self.memory_size
@@ -176,6 +186,8 @@ class PPOAlgorithm(Algorithm):
                 size = minibatch.advantage.shape[1]
                 terms.rehearsal = self._drawn(state, batch.rehearsal, size, rng)
             report, learns = learn(state, leaves, minibatch, terms, None if all_learn else active)
+            if follows_kl and reports:  # before the first step there is nothing to measure
+                terms.rate = kl_adapted_rate(terms.rate, report["kl"], target, *self._rates)
             reports.append(report)
             learnt.append(active)
             active = active if learns is None else learns
@@ -185,18 +197,23 @@ class PPOAlgorithm(Algorithm):
         steps = counted.sum(0).clamp_min(1.0)
         for name in reports[0]:
             metrics[name] = (torch.stack([r[name] for r in reports]) * counted).sum(0) / steps
-        if cfg.learning_rate_schedule == "kl":
-            target = torch.full_like(rate, cfg.target_kl or 0.0)
-            state.learning_rate = kl_adapted_rate(rate, metrics["kl"], target, *_LR_RANGE)
+        if follows_kl:
+            state.learning_rate = terms.rate
         return state, Report(metrics | {"learning_rate": rate, "samples": count})
 
     @property
     def _kl_limit(self) -> float | None:
         """Return the KL beyond which a member stops learning from this rollout; None: no limit."""
         cfg = self.config
-        if cfg.target_kl is None or cfg.learning_rate_schedule == "kl":
+        if cfg.target_kl is None:
             return None
-        return 1.5 * float(cfg.target_kl)  # as in Stable-Baselines3
+        farthest = FARTHEST_BY_KL if cfg.learning_rate_schedule == "kl" else FARTHEST
+        return farthest * float(cfg.target_kl)
+
+    @property
+    def _rates(self) -> tuple[float, float]:
+        """Return the lowest and the highest learning rate of the schedule 'kl'."""
+        return LEAST_RATE, min(LARGEST_RATE, RISE * float(self.config.learning_rate))
 
     @functools.cached_property
     def _compiled(self) -> Compiled:
@@ -249,14 +266,16 @@ class PPOAlgorithm(Algorithm):
         mean_entropy = bonus = masked_mean(entropy, acted)
         if (surplus := self.head.surplus(dist_params, log_std)) is not None:
             bonus = mean_entropy - masked_mean(surplus, acted)
+        report = {"policy_loss": policy, "value_loss": value, "entropy": mean_entropy}
+        with torch.no_grad():
+            report["kl"] = approximate_kl(log_prob, old, weight, acted)
+        if terms.critic_alone:
+            return state.vf_coef * value, {k: v.detach() for k, v in report.items()}
         total = policy + state.vf_coef * value - terms.ent_coef * bonus
         if terms.openness is not None:
             logits = dist_params[..., : self.choice.width]  # without those of goals
             away = self.choice.kl(torch.zeros_like(logits), None, logits, None, batch.mask)
             total = total + terms.openness * masked_mean(away, acted)
-        with torch.no_grad():
-            kl = approximate_kl(log_prob, old, weight, acted)
-        report = {"policy_loss": policy, "value_loss": value, "entropy": mean_entropy, "kl": kl}
         if terms.reference is not None:
             params = terms.reference.params
             other = None if params is None else params.views.get("actor.log_std")
@@ -326,7 +345,7 @@ class PPOAlgorithm(Algorithm):
         cells = Cells(rollout, all_cells=memory is not None)
         obs = cells.flat(rollout.obs)
         valid = cells.flat_or_none(rollout.valid)
-        self.update_obs_stats(state, obs, valid)
+        self.update_obs_stats(state, obs, valid, scales=not rollout.keeps_scaling)
         params = self.learning_params(state)
         inputs = self.inputs(params, obs)
         if memory is not None:
@@ -462,6 +481,7 @@ class Terms:
     ent_coef: Tensor  # (P,)
     reference: Reference | None
     openness: Tensor | None  # (P,), cost of a nat of KL from uniform choices; None: no epsilon
+    critic_alone: bool = False  # the policy stays as it is
     rehearsal: RehearsalRows | None = None  # of the present minibatch
 
     @classmethod
@@ -469,10 +489,12 @@ class Terms:
         """Return the terms of an update from this rollout."""
         progress = rollout.progress
         rate = rate_now(config, state.learning_rate, progress)
+        if rollout.critic_alone and config.learning_rate_schedule == "kl":
+            rate = torch.full_like(rate, CRITIC_RATE)
         ent_coef = state.ent_coef
         final = config.ent_coef_final
         if final is not None:
             ent_coef = torch.lerp(ent_coef, torch.full_like(ent_coef, final), progress)
         epsilon = epsilon_now(config, progress, rate)
         openness = None if epsilon is None else OPENNESS * epsilon.flatten()
-        return cls(rate, ent_coef, rollout.reference, openness)
+        return cls(rate, ent_coef, rollout.reference, openness, rollout.critic_alone)

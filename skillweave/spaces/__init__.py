@@ -9,6 +9,7 @@ from skillweave.spaces.action_codec import (
     JointCodec,
     action_codec,
     choice_counts,
+    is_continuous,
 )
 from skillweave.spaces.choices import (
     ChoiceCodec,
@@ -31,6 +32,7 @@ __all__ = [
     "action_codec",
     "choice_codec",
     "choice_counts",
+    "is_continuous",
     "leaves",
     "numbered_choice_codec",
     "obs_codec",

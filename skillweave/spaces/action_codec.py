@@ -234,6 +234,13 @@ def _codec(space: gym.Space[Any], place: tuple[str, ...]) -> ActionCodec:
     return ActionCodec(space, (), space.low.reshape(-1), space.high.reshape(-1))
 
 
+def is_continuous(space: gym.Space[Any]) -> bool:
+    """Return whether some numbers of an action are continuous."""
+    if (named := parts(space)) is not None:
+        return any(map(is_continuous, named.values()))
+    return isinstance(space, gym.spaces.Box) and bool(np.issubdtype(space.dtype, np.floating))
+
+
 def choice_counts(space: gym.Space[Any]) -> tuple[int, ...]:
     """Return the number of values of each choice of an action; (): it has none, or no codec."""
     try:

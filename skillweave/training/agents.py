@@ -18,7 +18,7 @@ from skillweave._internal.seeding import Seeds, global_generators, seed_global_g
 from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm, state_from
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.batches import Reference
-from skillweave.algorithms.config import config_from_json
+from skillweave.algorithms.config import PPO, config_from_json
 from skillweave.buffers.recorded_steps import RecordedSteps
 from skillweave.envs.checked import longest_evaluation
 from skillweave.envs.engine import Engine
@@ -31,8 +31,9 @@ from skillweave.ops.threads import torch_threads
 from skillweave.policies.core import Array
 from skillweave.policies.untrusted import shown
 from skillweave.runs.initial_policies import initial_policy
-from skillweave.runs.manifest import StageEntry
+from skillweave.runs.manifest import StageEntry, Start
 from skillweave.schema import fit
+from skillweave.spaces import is_continuous
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.joint import JointLearner
 from skillweave.training.keep_best import KeepBest
@@ -49,10 +50,10 @@ from skillweave.training.stage_log import StageLog, resumed, success_rate
 from skillweave.training.stage_run import StageRun
 from skillweave.workers.placement import MakeCollectors, make_collectors
 
-CRITIC_FIRST, SHARE = 5, 0.1
-"""Updates in which a critic learns alone, where the policy was learnt without it, and the most of a
-stage's budget that they take: by the advantages of a critic that has learnt nothing the first
-updates would undo the policy."""
+CRITIC_FEWEST, CRITIC_MOST, CRITIC_SHARE = 5, 20, 0.2
+"""Updates in which a critic learns alone, where the policy was learnt without it: at least, at
+most, and the most of a stage's budget that they take. By the advantages of a critic that has learnt
+nothing the first updates would undo the policy."""
 EARLY = 0.25
 """Share of a stage's budget after which skills without a call are reported."""
 
@@ -135,13 +136,20 @@ class Agents:
 
     def _config(self, name: str) -> Any:
         """Return a learner's settings, with the networks that it has grown in a population."""
-        config = config_from_json(self.entry.algorithms.get(name, self.entry.algorithm))
+        config: Any = config_from_json(self.entry.algorithms.get(name, self.entry.algorithm))
+        if isinstance(config, PPO) and self._given(name) is not None:
+            config = config.learning_on(continuous=is_continuous(self.roles[name].spaces[1]))
         earlier = self.stage.policies.get(name)
         if not isinstance(earlier, AgentPolicy):
             return config
         settings: Any = earlier.algorithm.config
         grown = {k: getattr(settings, k) for k in ("network", "critic") if hasattr(settings, k)}
         return replace(config, **grown)
+
+    def _given(self, name: str) -> Start | None:
+        """Return the policy that a learner was given for this stage or an earlier one, or None."""
+        stages = [*self.stage.stages_before(name), self.entry]
+        return next((s.starts[name] for s in stages if name in s.starts), None)
 
     def _equal_algorithm(self, *wanted: Any) -> Algorithm | None:
         """Return an algorithm with equal settings and spaces: it need not be compiled again.
@@ -249,10 +257,12 @@ class Agents:
             first = name == self.entry.decides
             keep_to_guide(learner, self.entry.guide_kl if first else self.roles[name].guide_kl)
             rehearse(learner, self.log.run, self.entry, self.stage.policies.get(name))
+            learner.keeps_scaling = self._given(name) is not None
             start = self.entry.starts.get(name)
             if start is not None and not start.critic and not tensors:
                 each = int(algorithm.config.n_steps) * self.entry.num_envs
-                learner.critic_first = min(CRITIC_FIRST, int(SHARE * self.entry.budget) // each)
+                most = min(CRITIC_MOST, int(CRITIC_SHARE * self.entry.budget) // each)
+                learner.critic_first = min(CRITIC_FEWEST, most), most
         elif self.earlier[name] is not None or name in self.entry.starts:
             learner.act_from_the_start()
         return learner

@@ -21,6 +21,9 @@ from skillweave.buffers.rollout import RolloutStore
 from skillweave.experience.acting import Request
 from skillweave.policies.core import Array
 
+KNOWN = 0.5
+"""The explained variance of returns from which a policy is changed by its critic."""
+
 
 @dataclass
 class Stack:
@@ -101,8 +104,11 @@ class RolloutLearner:
         """The reference policy that it stays near; None: without one."""
         self.rehearsal: Rehearsal | None = None
         """Observations in which it keeps what an earlier policy did; None: it may change all."""
-        self.critic_first = 0
-        """The next updates in which the critic learns alone: its policy was learnt without it."""
+        self.critic_first = (0, 0)
+        """The fewest and the most of the next updates in which the critic learns alone, as its
+        policy was learnt without it: until it explains returns."""
+        self.keeps_scaling = False
+        """Observations stay scaled as for the policy that was given."""
         self._progress = 0.0  # at the start of the rollout, so that the first has the whole rate
         self._resumed: ActingParams | None = None  # of the first request after a checkpoint
 
@@ -135,32 +141,21 @@ class RolloutLearner:
         if rollout is None:
             return {}
         rollout.rehearsal = self.rehearsal
+        rollout.keeps_scaling = self.keeps_scaling
+        rollout.critic_alone = self.critic_first[1] > 0
         seeds = member_seeds(self._seeds, "learn", stack.members, update)
         generators = [s.torch() for s in seeds]
-        actor = self._actor() if self.critic_first else {}
         with torch.enable_grad():  # the user may have switched gradients off
             stack.state, report = stack.algorithm.update(stack.state, rollout, generators)
-        if actor:
-            self._put_back(actor)
         metrics: dict[str, Tensor] = report.metrics
+        if rollout.critic_alone:
+            fewest, most = (max(0, updates - 1) for updates in self.critic_first)
+            known = not fewest and float(metrics["explained_variance"].min()) > KNOWN
+            self.critic_first = (0, 0) if known else (fewest, most)
         if reference is not None and "reference_kl" in metrics:
             kl = metrics["reference_kl"]
             reference.coef = adapted(reference.coef, kl, reference.target_kl)
         return metrics
-
-    def _actor(self) -> dict[str, Tensor]:
-        """Return copies of the actor's weights."""
-        weights = self._stack.algorithm.weights(self._stack.state)
-        return {name: x.clone() for name, x in weights.items() if name.startswith("actor.")}
-
-    def _put_back(self, actor: dict[str, Tensor]) -> None:
-        """Undo what an update did to the actor; after the last such update also its momentum."""
-        algorithm, state = self._stack.algorithm, self._stack.state
-        algorithm.set_weights(state, dict(algorithm.weights(state)) | actor)
-        self.critic_first -= 1
-        if not self.critic_first:
-            for moment in (state.mu, state.nu, state.count):
-                moment.zero_()
 
     def cut(self, columns: Array) -> None:
         """Do nothing: trajectories end with each batch."""
@@ -171,7 +166,7 @@ class RolloutLearner:
         coef = {} if reference is None else {"reference_coef": reference.coef.cpu().clone()}
         params, _ = self._requested
         acting = prefixed("acting", params.state()) if requested else {}
-        first = {"critic_first": torch.tensor(self.critic_first)} if self.critic_first else {}
+        first = {"critic_first": torch.tensor(self.critic_first)} if any(self.critic_first) else {}
         return self._store.state() | coef | acting | first
 
     def load(self, kept: dict[str, Tensor]) -> None:
@@ -180,7 +175,8 @@ class RolloutLearner:
         acting = unprefixed("acting", kept)
         self._resumed = acting_of(self._stack, acting) if acting else None
         self._store.load(kept, algorithm.observation_space, algorithm.codec)
-        self.critic_first = int(kept.get("critic_first", 0))
+        fewest, most = kept["critic_first"].tolist() if "critic_first" in kept else (0, 0)
+        self.critic_first = fewest, most
         if self.reference is not None:
             self.reference.coef = kept["reference_coef"].to(self.reference.coef.device)
 

@@ -12,6 +12,7 @@ from skillweave.algorithms.config import (
     PPO,
 )
 from skillweave.algorithms.ppo import PPOAlgorithm, State
+from skillweave.algorithms.schedules import Linear
 from skillweave.networks.config import RNN, Network
 from skillweave.ops.moments import normalize
 from skillweave.ops.returns import gae
@@ -321,10 +322,68 @@ def test_a_rollout_of_any_size_is_learnt_from(columns, steps, asks, rnn):
 
 
 def test_the_kl_schedule_speeds_a_timid_member_up_and_slows_a_bold_one_down():
-    algorithm, state = make(members=2, learning_rate_schedule="kl", target_kl=1e-3)
+    two = {"update_epochs": 1, "batch_size": T * B // 2}
+    algorithm, state = make(
+        members=2, learning_rate_schedule="kl", learning_rate=1e-3, target_kl=1e-3, **two
+    )
     state.learning_rate = torch.tensor([2e-5, 9e-3])
     algorithm.update(state, rollout_of(algorithm, state), rngs(0, 1))
+    # Only the second minibatch tells what the first one has done.
     torch.testing.assert_close(state.learning_rate, torch.tensor([3e-5, 6e-3]))
+
+
+def test_the_kl_schedule_stays_below_ten_times_its_first_rate_and_stops_a_bold_update():
+    algorithm, state = make(
+        learning_rate_schedule="kl", learning_rate=2e-5, target_kl=0.1, update_epochs=20
+    )
+    rollout = rollout_of(algorithm, state)
+    algorithm.update(state, rollout, rngs(0))
+    torch.testing.assert_close(state.learning_rate, torch.tensor([2e-4]))
+    algorithm, state = make(
+        learning_rate_schedule="kl", learning_rate=1e-2, target_kl=1e-6, update_epochs=20
+    )
+    algorithm.update(state, rollout, rngs(0))
+    assert state.count.item() < 20 * 3  # 4e-6 is reached long before
+
+
+def test_a_critic_that_learns_alone_leaves_the_policy_and_its_rate_as_they_are():
+    algorithm, state = make(
+        learning_rate_schedule="kl", learning_rate=1e-4, target_kl=0.01, ent_coef=0.1
+    )
+    before = algorithm.weights(state)
+    rollout = rollout_of(algorithm, state)
+    rollout.critic_alone = True
+    algorithm.update(state, rollout, rngs(0))
+    after = algorithm.weights(state)
+    same = {name for name in before if torch.equal(before[name], after[name])}
+    assert same == {name for name in before if name.startswith("actor.")}
+    torch.testing.assert_close(state.learning_rate, torch.tensor([1e-4]))
+
+
+@pytest.mark.parametrize("keeps", [False, True])
+def test_statistics_of_a_policy_that_was_given_stay(keeps):
+    algorithm, state = make(normalize_obs=True)
+    mean = state.obs_mean.clone()
+    rollout = rollout_of(algorithm, state)
+    rollout.keeps_scaling = keeps
+    algorithm.update(state, rollout, rngs(0))
+    assert torch.equal(state.obs_mean, mean) is keeps
+    assert (state.obs_high > state.obs_low).all()
+
+
+def test_settings_to_learn_on_are_small_steps_unless_they_were_set():
+    usual = PPO().learning_on(continuous=True)
+    assert (usual.learning_rate, usual.learning_rate_schedule, usual.target_kl) == (
+        1e-4,
+        "kl",
+        0.01,
+    )
+    assert usual.ent_coef == 0.0
+    assert PPO().learning_on(continuous=False).ent_coef == PPO().ent_coef
+    assert PPO(target_kl=0.02).learning_on(continuous=True).target_kl == 0.02
+    for own in (PPO(learning_rate=3e-4, ent_coef=0.001), PPO(learning_rate=Linear(3e-3, 0))):
+        kept = own.learning_on(continuous=False)
+        assert kept == own
 
 
 def test_a_terminal_observation_that_is_not_finite_does_no_harm():
