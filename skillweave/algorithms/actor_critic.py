@@ -11,16 +11,19 @@ from torch import Tensor
 
 from skillweave._internal.seeding import Seeds
 from skillweave.algorithms.base import ActingParams
-from skillweave.algorithms.batches import Sample
+from skillweave.algorithms.batches import Report, Sample
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm, OffPolicyState
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.networks.config import Network
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, Views
-from skillweave.ops.device import FLOAT, INT
+from skillweave.ops.device import BOOL, FLOAT, INT, all_false
 from skillweave.ops.losses import critic_loss
 from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.spaces import ObsCodec
+
+LEAST_STEP = 1e-3
+"""The least unit of critics' values, as a share of what an end pays: for discounts of nearly 1."""
 
 
 @dataclass
@@ -33,6 +36,8 @@ class ActorCriticState(OffPolicyState):
     critic_nu: Tensor  # (P, K, D)
     critic_count: Tensor  # (P,) int64, or (P, K, D)
     policy_loss: Tensor  # (P,), the latest, for the metrics
+    end_pay: Tensor  # (P,), the most that a terminal step has paid, at least 0
+    paid_before: Tensor  # (P,) bool, another step has paid or cost something
 
 
 class ActorCriticAlgorithm(OffPolicyAlgorithm):
@@ -44,12 +49,19 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
 
     actor_weights: ClassVar[tuple[str, ...]] = ("params",)
     """The fields of the state with the actor, and with its slow copy if it has one."""
+    counts_to_end: ClassVar[bool] = False
+    """True if critics learn the cost of the way where terminal steps alone pay; see ``units``."""
     net: Net
     critics: Critics
 
     def fresh_fields(self, params: Tensor) -> dict[str, Tensor]:
         """Return the fresh fields of a state except the critics."""
-        return super().fresh_fields(params) | {"policy_loss": torch.zeros(len(params), **FLOAT)}
+        members = len(params)
+        return super().fresh_fields(params) | {
+            "policy_loss": torch.zeros(members, **FLOAT),
+            "end_pay": torch.zeros(members, **FLOAT),
+            "paid_before": torch.zeros(members, **BOOL),
+        }
 
     def fresh_networks(self, seeds: Sequence[Seeds]) -> dict[str, Tensor]:
         """Return the fresh fields of a state with fresh networks."""
@@ -70,6 +82,61 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
         actor = ParameterGroup(self.layout, (("network", self.net),), self.actor_weights)
         return [actor, self.critics.group()]
 
+    def update(
+        self, state: Any, batch: Sample, rng: Sequence[torch.Generator]
+    ) -> tuple[Any, Report]:
+        """Take one gradient step, in place, in the units that the rewards seen so far ask for."""
+        if self.counts_to_end:
+            self._see_rewards(state, batch)
+        return super().update(state, batch, rng)
+
+    @torch.no_grad()
+    def _see_rewards(self, state: Any, sample: Sample) -> None:
+        """Note which steps pay; where that changes the units, let critics keep their values."""
+        ends = sample.discount == 0.0
+        paid = torch.where(ends, sample.reward, 0.0).amax(1)
+        before = state.paid_before | ((sample.reward != 0.0) & ~ends).any(1)
+        most = state.end_pay.maximum(paid)
+        if all_false((most != state.end_pay) | (before != state.paid_before)):
+            return
+        shift, unit = self.units(state)
+        first = state.end_pay[:, None] == 0.0  # nothing was paid: there are no values to keep
+        state.end_pay, state.paid_before = most, before
+        new_shift, new_unit = self.units(state)
+        factor = torch.where(first, 1.0, unit / new_unit)
+        moved = torch.where(first, 0.0, (shift - new_shift) / new_unit)
+        self.critics.convert_(state, factor, moved)
+
+    def units(self, state: Any) -> tuple[Tensor, Tensor]:
+        """Return the shift and the unit of critics' values, (P, 1): V = unit · output + shift.
+
+        Where terminal steps alone pay, at most c, critics learn V − c in units of (1 − γ)c, exact
+        for any rewards, r′ = r − c(1 − discount): as if each step cost 1 and an end that pays c
+        nothing. Around V itself values of near and far states would differ by so little that
+        entropy, whose unit is 1, outweighs them.
+        """
+        scale = self.reward_scale(state)
+        usual = state.gamma.new_ones(len(state.gamma), 1) if scale is None else scale.reciprocal()
+        if not self.counts_to_end:
+            return torch.zeros_like(usual), usual
+        pay = torch.where(state.paid_before, 0.0, state.end_pay)[:, None]
+        unit = pay * (1.0 - state.gamma[:, None]).clamp_min(LEAST_STEP)
+        return pay, torch.where(pay > 0.0, unit, usual)
+
+    def rewards(self, state: Any, sample: Sample) -> Tensor:
+        """Return rewards (P, B) in the units that critics learn in."""
+        if not self.counts_to_end:
+            return super().rewards(state, sample)
+        shift, unit = self.units(state)
+        return (sample.reward - shift * (1.0 - sample.discount)) / unit
+
+    def in_rewards(self, state: Any, value: Tensor) -> Tensor:
+        """Convert values (P, B) from the critics' units to units of reward."""
+        if not self.counts_to_end:
+            return super().in_rewards(state, value)
+        shift, unit = self.units(state)
+        return value * unit + shift
+
     def learn(
         self, state: Any, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
@@ -82,6 +149,7 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
         q = self.critics.chosen(leaves, inputs, sample.action)
         loss, error, mean = critic_loss(q, target, sample.weight)
         norm = self.critics.step_(state, loss, leaves, rate, self.config.adam_eps)
+        mean = self.in_rewards(state, mean[:, None])[:, 0]
         metrics = {"critic_loss": loss.detach(), "q": mean, "grad_norm": norm}
         if due:
             self.improve_policy(state, sample, inputs, rate, noise)
@@ -156,6 +224,14 @@ class Critics:
         moments = ("critic_mu", "critic_nu")
         nets = (("critic", self.net),)
         return ParameterGroup(self.layout, nets, weights, moments, "critic_count")
+
+    def convert_(self, state: Any, factor: Tensor, shift: Tensor) -> None:
+        """Change the last layers of critics and slow copies: output · factor + shift, (P, 1)."""
+        each = [x.repeat_interleave(self.count, 0)[:, None] for x in (factor, shift)]  # (P·K, 1, 1)
+        for flat in (state.critic, state.critic_target):
+            views = self.views(flat)
+            views[f"{self.net.head}.weight"].mul_(each[0])
+            views[f"{self.net.head}.bias"].mul_(each[0]).add_(each[1])
 
     def views(self, flat: Tensor) -> dict[str, Tensor]:
         """Return windows into (P, K, D), each (P·K, *shape)."""

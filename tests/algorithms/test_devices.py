@@ -186,7 +186,7 @@ def test_what_an_update_draws_is_moved_to_the_batch():
     algorithm.learn = lambda state, batch, rate, noise, due: seen.extend(noise) or ({}, None)
     zeros = torch.zeros(1, B, device="meta")
     batch = Sample(zeros, zeros, zeros, zeros, zeros, None, None, None, np.zeros((1, B), int))
-    algorithm.update(state, batch, [Seeds(0).torch()])
+    algorithm.update(state_to(state, "meta"), batch, [Seeds(0).torch()])
     assert [x.device.type for x in seen] == ["meta", "meta"]
 
 

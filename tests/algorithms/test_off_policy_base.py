@@ -163,3 +163,68 @@ def test_the_slow_networks_turn_comes_beyond_what_a_float_can_count():
         moved.append(not torch.equal(state.params, before))
     assert moved == [False, True, False, True]
     assert state.updates.tolist() == [(1 << 24) + 4]
+
+
+def sample_of(reward, discount, **fields) -> Sample:
+    """One member's transitions, all from and to the origin."""
+    rows = torch.tensor([reward])
+    zeros = torch.zeros(1, rows.shape[1], 3)
+    action = torch.full((1, rows.shape[1], 1), 0.1)
+    index = np.zeros(rows.shape, int)
+    return Sample(
+        zeros, action, rows, torch.tensor([discount]), zeros, None, None, None, index, **fields
+    )
+
+
+def learner_of_ends(kind, **settings):
+    config = kind(num_envs=2, gamma=0.9, normalize_obs=False, network=Network((8,)), **settings)
+    algorithm = make_algorithm(config, Box(-1, 1, (3,)), Box(-1, 1, (1,)))
+    return algorithm, algorithm.init([Seeds(0)])
+
+
+@pytest.mark.parametrize("kind", [SAC, TD3])
+def test_where_ends_alone_pay_critics_learn_the_cost_of_the_way(kind):
+    """At an end that pays 2, V - 2 in units of 0.2: each step costs 1, the end pays nothing."""
+    algorithm, state = learner_of_ends(kind)
+    paid = sample_of([0.0, 2.0, 0.0, 2.0 * 0.9], [0.9, 0.0, 0.81, 0.0])
+    algorithm.update(state, paid, [Seeds(0).torch()])
+    assert (state.end_pay.item(), state.paid_before.item()) == (2.0, False)
+    # The last one: two steps to an end, of which the first cost 1.
+    by_hand = torch.tensor([[-1.0, 0.0, -1.9, -1.0]])
+    torch.testing.assert_close(algorithm.rewards(state, paid), by_hand)
+    # A value of -3 steps that each cost 1, in the user's units: 2 * 0.9**3 = 1.458.
+    cost = torch.tensor([[-(1 + 0.9 + 0.81)]])
+    torch.testing.assert_close(algorithm.in_rewards(state, cost), torch.tensor([[1.458]]))
+
+
+@pytest.mark.parametrize("kind", [SAC, TD3])
+@pytest.mark.parametrize(("reward", "discount"), [([0.5, 4.0], [0.9, 0.0]), ([0.1], [0.9])])
+def test_values_stay_where_other_rewards_change_the_units(kind, reward, discount):
+    algorithm, state = learner_of_ends(kind)
+    obs = torch.rand(1, 5, 3)
+    algorithm.update(state, sample_of([0.0, 2.0], [0.9, 0.0]), [Seeds(0).torch()])
+    state.critic += 0.1 * torch.randn(state.critic.shape, generator=Seeds(1).torch())
+    inputs = {"vector": obs}
+    action = torch.zeros(1, 5, 1)
+
+    def value():
+        return algorithm.in_rewards(state, algorithm.smallest(state.critic, inputs, action))
+
+    before = value()
+    assert before.std() > 1e-3
+    algorithm._see_rewards(state, sample_of(reward, discount))
+    assert state.paid_before.item()
+    torch.testing.assert_close(value(), before)
+    torch.testing.assert_close(
+        algorithm.rewards(state, sample_of(reward, discount)), torch.tensor([reward])
+    )
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_other_rewards_are_learnt_as_they_are(normalize):
+    algorithm, state = learner_of_ends(SAC, normalize_rewards=normalize)
+    state.return_var, state.return_count = torch.full((1, 1), 4.0), torch.full((1,), 9.0)
+    costs = sample_of([-1.0, 0.0, 3.0], [0.9, 0.9, 0.0])
+    algorithm.update(state, costs, [Seeds(0).torch()])
+    scale = 2.0 if normalize else 1.0
+    torch.testing.assert_close(algorithm.rewards(state, costs) * scale, costs.reward)
