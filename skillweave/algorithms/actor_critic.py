@@ -49,8 +49,9 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
 
     actor_weights: ClassVar[tuple[str, ...]] = ("params",)
     """The fields of the state with the actor, and with its slow copy if it has one."""
-    counts_to_end: ClassVar[bool] = False
-    """True if critics learn the cost of the way where terminal steps alone pay; see ``units``."""
+    follows_critics: ClassVar[bool] = True
+    """The policy is improved by the critics' values alone: it may wait until they have learnt
+    something, and their units are free, see ``units``."""
     net: Net
     critics: Critics
 
@@ -86,7 +87,7 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
         self, state: Any, batch: Sample, rng: Sequence[torch.Generator]
     ) -> tuple[Any, Report]:
         """Take one gradient step, in place, in the units that the rewards seen so far ask for."""
-        if self.counts_to_end:
+        if self.follows_critics:
             self._see_rewards(state, batch)
         return super().update(state, batch, rng)
 
@@ -117,7 +118,7 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
         """
         scale = self.reward_scale(state)
         usual = state.gamma.new_ones(len(state.gamma), 1) if scale is None else scale.reciprocal()
-        if not self.counts_to_end:
+        if not self.follows_critics:
             return torch.zeros_like(usual), usual
         pay = torch.where(state.paid_before, 0.0, state.end_pay)[:, None]
         unit = pay * (1.0 - state.gamma[:, None]).clamp_min(LEAST_STEP)
@@ -125,14 +126,14 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
 
     def rewards(self, state: Any, sample: Sample) -> Tensor:
         """Return rewards (P, B) in the units that critics learn in."""
-        if not self.counts_to_end:
+        if not self.follows_critics:
             return super().rewards(state, sample)
         shift, unit = self.units(state)
         return (sample.reward - shift * (1.0 - sample.discount)) / unit
 
     def in_rewards(self, state: Any, value: Tensor) -> Tensor:
         """Convert values (P, B) from the critics' units to units of reward."""
-        if not self.counts_to_end:
+        if not self.follows_critics:
             return super().in_rewards(state, value)
         shift, unit = self.units(state)
         return value * unit + shift
@@ -151,7 +152,7 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
         norm = self.critics.step_(state, loss, leaves, rate, self.config.adam_eps)
         mean = self.in_rewards(state, mean[:, None])[:, 0]
         metrics = {"critic_loss": loss.detach(), "q": mean, "grad_norm": norm}
-        if due:
+        if due and not sample.critic_alone:
             self.improve_policy(state, sample, inputs, rate, noise)
         self.move_targets(state, due)
         return metrics | {"policy_loss": state.policy_loss, "learning_rate": rate}, error

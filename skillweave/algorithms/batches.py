@@ -330,6 +330,7 @@ class Sample:
     """(P, B, n − 1), the factor of a reward there: γ^Στ, or 0 where the rows ended before."""
     env_reward: Tensor | None = None
     """(P, B) the environment's own in the first row, where it is needed."""
+    critic_alone: bool = False  # the policy stays as it is, while its critics learn
     progress: float = 0.0  # share of the budget that is spent, for schedules
 
     def split(self, batch: int) -> Iterator[Sample]:
@@ -339,7 +340,8 @@ class Sample:
         for start in range(0, size, batch):
             rows = slice(start, start + batch)
             part: dict[str, Any] = {
-                k: v if v is None or isinstance(v, float) else v[:, rows] for k, v in whole.items()
+                k: v if v is None or isinstance(v, float | bool) else v[:, rows]
+                for k, v in whole.items()
             }
             yield Sample(**part)
 

@@ -543,6 +543,18 @@ class SAC(ActorCritic):
     policy_delay: AtLeastOne = 1
     """Critic updates for each update of the actor."""
 
+    def learning_on(self, *, continuous: bool) -> SAC:
+        """Return the settings by which a learner goes on from a policy that was given.
+
+        A learnt α begins at 0.1, unless ``ent_coef`` is not its default: at 1 entropy would be
+        worth more than what the policy can do.
+
+        Args:
+            continuous: some numbers of an action are continuous.
+        """
+        usual = self.learn_ent_coef and self.ent_coef == type(self)().ent_coef
+        return replace(self, ent_coef=0.1) if usual else self
+
 
 @settings
 class IQL(ActorCritic):

@@ -37,6 +37,7 @@ class IQLAlgorithm(ActorCriticAlgorithm):
     """IQL on one pair of spaces; ``params`` are the actor, and the net of states' values."""
 
     state_type = ActorCriticState
+    follows_critics = False
     interval = 1
     head: ActionHead
 

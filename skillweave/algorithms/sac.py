@@ -54,7 +54,6 @@ class SACAlgorithm(ActorCriticAlgorithm):
     """SAC on one pair of spaces; all that is learnt is in ``State``."""
 
     state_type = State
-    counts_to_end = True
     member_hyperparameters = ("learning_rate", "gamma", "tau", "max_grad_norm", "ent_coef")
     between = True
     head: ActionHead

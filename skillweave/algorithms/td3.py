@@ -41,7 +41,6 @@ class TD3Algorithm(ActorCriticAlgorithm):
     """TD3 on one pair of spaces; all that is learnt is in ``State``."""
 
     state_type = State
-    counts_to_end = True
 
     actor_weights = ("params", "target")
     member_hyperparameters = (

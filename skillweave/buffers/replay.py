@@ -262,7 +262,7 @@ class ReplayStore:
             surplus *= 2  # where some columns are nearly empty
         return drawn[:batch]
 
-    def _between_fields(self, between: list[tuple[Array, Array]]) -> dict[str, Tensor | None]:
+    def _between_fields(self, between: list[tuple[Array, Array]]) -> dict[str, Any]:
         """Return the observations between the n steps, at slots (P, B), with their discounts."""
         if not self._between:
             return {}

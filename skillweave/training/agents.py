@@ -15,10 +15,11 @@ from torch import Tensor
 from skillweave._internal.paths import CRITIC, SELECTOR, decides, level_of, relative
 from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds, global_generators, seed_global_generators
+from skillweave.algorithms.actor_critic import ActorCriticAlgorithm
 from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm, state_from
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.batches import Reference
-from skillweave.algorithms.config import PPO, config_from_json
+from skillweave.algorithms.config import PPO, SAC, config_from_json
 from skillweave.buffers.recorded_steps import RecordedSteps
 from skillweave.envs.checked import longest_evaluation
 from skillweave.envs.engine import Engine
@@ -43,7 +44,7 @@ from skillweave.training.loop import Loop, LoopState, Saved
 from skillweave.training.offline import AfterData, data_steps_of
 from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 from skillweave.training.rehearsal import rehearse
-from skillweave.training.replay_learner import ReplayLearner, judge_of
+from skillweave.training.replay_learner import CriticsFirst, ReplayLearner, judge_of
 from skillweave.training.stack_learner import learner_of
 from skillweave.training.stage import Together
 from skillweave.training.stage_log import StageLog, resumed, success_rate
@@ -137,7 +138,7 @@ class Agents:
     def _config(self, name: str) -> Any:
         """Return a learner's settings, with the networks that it has grown in a population."""
         config: Any = config_from_json(self.entry.algorithms.get(name, self.entry.algorithm))
-        if isinstance(config, PPO) and self._given(name) is not None:
+        if isinstance(config, PPO | SAC) and self._given(name) is not None:
             config = config.learning_on(continuous=is_continuous(self.roles[name].spaces[1]))
         earlier = self.stage.policies.get(name)
         if not isinstance(earlier, AgentPolicy):
@@ -265,6 +266,11 @@ class Agents:
                 learner.critic_first = min(CRITIC_FEWEST, most), most
         elif self.earlier[name] is not None or name in self.entry.starts:
             learner.act_from_the_start()
+            learner.keeps_scaling = self._given(name) is not None
+            waits = isinstance(algorithm, ActorCriticAlgorithm) and algorithm.follows_critics
+            if waits and name in self.entry.starts and not tensors:
+                due = float(algorithm.config.update_ratio) * self.entry.budget
+                learner.critics_first = CriticsFirst(int(CRITIC_SHARE * due))
         return learner
 
     def _data(self) -> RecordedSteps | None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,45 @@ from skillweave.training.role import Role
 
 DRAWN_AT_ONCE = 8
 """Gradient steps whose samples are drawn at once."""
+LOOK, SETTLED = 200, 0.05
+"""Gradient steps after which critics that learn alone are looked at; and the share of their mean
+value by which it may change between two looks, where they are said to have settled."""
+
+
+@dataclass
+class CriticsFirst:
+    """The gradient steps in which critics learn alone, as their policy was learnt without them."""
+
+    left: int
+    """The most of the next gradient steps."""
+    seen: int = 0
+    """Gradient steps since the latest look."""
+    total: float = 0.0
+    """The sum of the mean values since then."""
+    before: float = math.nan
+    """The mean value between the two latest looks."""
+
+    def see(self, value: float) -> None:
+        """Count a gradient step with this mean value."""
+        self.left -= 1
+        self.seen += 1
+        self.total += value
+        if self.seen < LOOK:
+            return
+        now = self.total / LOOK
+        if abs(now - self.before) <= SETTLED * abs(now):
+            self.left = 0
+        self.seen, self.total, self.before = 0, 0.0, now
+
+    def tensor(self) -> Tensor:
+        """Return its numbers, for a checkpoint."""
+        return torch.tensor([self.left, self.seen, self.total, self.before], dtype=torch.float64)
+
+    @classmethod
+    def of(cls, kept: Tensor) -> CriticsFirst:
+        """Return it as ``tensor`` recorded it."""
+        left, seen, total, before = kept.tolist()
+        return cls(int(left), int(seen), total, before)
 
 
 class ReplayLearner:
@@ -73,6 +114,10 @@ class ReplayLearner:
         self._returns: Array | None = None  # (N,), the open episodes' discounted returns
         self._acting: tuple[ActingParams, ...] = ()  # of the latest request
         self._resumed: tuple[ActingParams, ...] = ()  # of the first request after a checkpoint
+        self.keeps_scaling = False
+        """Observations stay scaled as for the policy that was given."""
+        self.critics_first: CriticsFirst | None = None
+        """Critics learn alone at first; None: the policy learns, too."""
 
     def act_from_the_start(self) -> None:
         """Skip the phase of random actions: the policy is trained already."""
@@ -161,6 +206,7 @@ class ReplayLearner:
                 stack.state,
                 _rows(obs, columns, stack),
                 None if valid is None else _rows(valid, columns, stack),
+                scales=not self.keeps_scaling,
             )
 
     def _scale_returns(self, batch: Batch) -> None:
@@ -226,9 +272,14 @@ class ReplayLearner:
             size = cfg.batch_size * min(draws, due - done)
             drawn = self.store.sample(size, gamma, rngs, beta, first, progress)
             for sample in drawn.split(cfg.batch_size):
+                alone = self.critics_first
+                sample.critic_alone = alone is not None
                 with torch.enable_grad():  # the user may have switched gradients off
                     stack.state, report = stack.algorithm.update(stack.state, sample, generators)
                 metrics = report.metrics
+                if alone is not None:
+                    alone.see(float(metrics["q"].mean()))
+                    self.critics_first = alone if alone.left > 0 else None
                 if cfg.prioritized:
                     self.store.update_priorities(sample.index, report.error, first)
         return metrics
@@ -253,11 +304,15 @@ class ReplayLearner:
         counts = {"transitions": torch.from_numpy(self._transitions.copy())}
         if self._returns is not None:
             counts["returns"] = torch.from_numpy(self._returns.copy())
+        if self.critics_first is not None:
+            counts["critics_first"] = self.critics_first.tensor()
         return counts
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """Restore the tensors of a checkpoint."""
         self._transitions = kept["transitions"].numpy().copy()
+        if "critics_first" in kept:
+            self.critics_first = CriticsFirst.of(kept["critics_first"])
         if "returns" in kept:
             self._returns = kept["returns"].numpy().copy()
         if acting := unprefixed("acting", kept):  # a generation starts with its own request
