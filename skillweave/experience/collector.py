@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -217,6 +217,8 @@ class Collector:
         self._prepare(request)
         steps, self._ended = 0, []
         while steps < max_steps and playing.any():
+            if not request.greedy:  # what it needs of chance is drawn for so many steps
+                self._prepare(replace(request, rows=PLAYED, seeds=request.seeds / steps))
             writer = self._writer(min(PLAYED, max_steps - steps))
             while writer.row < min(PLAYED, max_steps - steps) and playing.any():
                 self._step(writer)

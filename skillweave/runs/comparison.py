@@ -8,7 +8,7 @@ from typing import Literal
 from skillweave.schema import AtLeastOne
 
 Candidate = Literal[
-    "before", "greedy", "skills_sample", "selector_samples", "both_sample", "repaired"
+    "before", "given", "greedy", "skills_sample", "selector_samples", "both_sample", "repaired"
 ]
 """A hierarchy that a stage could end with."""
 
@@ -21,7 +21,10 @@ SAMPLING: dict[str, tuple[bool, bool]] = {
 """For each candidate: skills sample, the selector samples."""
 _WORDS = {
     "before": "before learning together",
+    "given": "as it was given",
+    "given_samples": "as it was given, sampling",
     "greedy": "greedy",
+    "samples": "sampling",
     "skills_sample": "with skills that sample",
     "selector_samples": "with a selector that samples",
     "both_sample": "with skills and a selector that sample",
@@ -30,14 +33,29 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class Comparison:
-    """The record of a run of the hierarchies compared at a stage's end, and the kept one."""
+    """The record of a run of what was compared at a stage's end, and what was kept.
+
+    Mean returns of hierarchies, or of a policy that was given and the one that learnt on from it.
+    """
 
     kept: Candidate
     before: float | None = None
+    given: float | None = None
+    """The policy that the stage was given."""
+    given_samples: float | None = None
     greedy: float | None = None
     skills_sample: float | None = None
     selector_samples: float | None = None
     both_sample: float | None = None
+    samples: float | None = None
+    given_success: float | None = None
+    """The share of episodes in which the policy that was given succeeded; None: unknown."""
+    success: float | None = None
+    """The same of the one that learnt on."""
+    worse: bool = False
+    """What learnt on from a policy that was given is clearly worse."""
+    samples_better: bool = False
+    """What learnt on is clearly better where it samples."""
     episodes: AtLeastOne | None = None
     """Episodes of each candidate; None: training was too short for a comparison."""
     sentence: str | None = None
@@ -57,4 +75,29 @@ class Comparison:
             for name, words in _WORDS.items()
             if (mean := getattr(self, name)) is not None
         )
-        return f"mean return {returns} ({self.episodes} episodes each); kept: {_WORDS[self.kept]}"
+        found = f"mean return {returns} ({self.episodes} episodes each)"
+        if self.given is None:
+            return f"{found}; kept: {_WORDS[self.kept]}"
+        if self.given_success is not None and self.success is not None:
+            found += f", success {self.given_success:.0%} as it was given, {self.success:.0%} now"
+        return found + self._advice()
+
+    def _advice(self) -> str:
+        """Return the end of the sentence on a policy that learnt on from one that was given."""
+        says = ""
+        if self.kept == "given":
+            says = (
+                ": clearly worse, so the policy that was given is kept. Smaller steps may help "
+                '(learning_rate), or more steps; keep="last" ends with what it has learnt'
+            )
+        elif self.worse:
+            says = (
+                ': clearly worse than what it was given. Without keep="last" the policy that was '
+                "given would be kept; smaller steps may help (learning_rate), or more steps"
+            )
+        if self.samples_better:
+            says += (
+                ". It is clearly better where it samples than greedily: "
+                "evaluate(deterministic=False)"
+            )
+        return says

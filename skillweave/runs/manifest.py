@@ -194,6 +194,12 @@ class Best:
     def __str__(self) -> str:
         """Return a sentence on it (``keep="best"``)."""
         what = "mean return" if self.of == "return" else "share of successes"
+        if not self.steps:
+            return (
+                f"kept the policy that was given, whose evaluation was best ({what} "
+                f"{self.value:.4g}): learning on made it no better. Smaller steps may help "
+                "(learning_rate), or more of them"
+            )
         return (
             f"kept the weights of step {self.steps:,}, whose evaluation was best: "
             f"{what} {self.value:.4g}"
@@ -206,6 +212,24 @@ class BestSoFar:
 
     steps: Count
     metrics: dict[str, float]
+
+
+@dataclass(frozen=True)
+class GivenScore:
+    """The score of the policy that a stage was given, in a checkpoint's header."""
+
+    rounds: AtLeastOne
+    """Rounds of episodes, one in each environment."""
+    longest: AtLeastOne
+    """Steps after which an episode was cut."""
+    returns: list[float]
+    """Of each episode."""
+    success: list[float]
+    """1 where an episode succeeded; empty: unknown."""
+    sampled: list[float]
+    """Returns of episodes in which the policy sampled; empty: there are none."""
+    length: NonNegative
+    """Mean steps of an episode."""
 
 
 @dataclass
@@ -418,8 +442,8 @@ class Manifest(Recorded):
     checkpoint_every: AtLeastOne
     eval_every: AtLeastOne | None
     eval_episodes: AtLeastOne
-    keep: Literal["last", "best"] = "last"
-    """The weights that stages end with."""
+    keep: Literal["last", "best"] | None = None
+    """The weights that stages end with; None: the last, or the best where a policy was given."""
     data: NoSetting[str | None] = None
     """The name of the data from which learners with a replay learn, too; None: there are none."""
     log_info: NoSetting[tuple[str, ...]]
@@ -537,6 +561,8 @@ class Checkpoint:
     kept_best: BestSoFar | None = None
     """The best evaluation so far, if the best weights are kept."""
     population: Generation | None = None
+    given: GivenScore | None = None
+    """The score of the policy that the stage was given."""
 
     @classmethod
     def start(cls, stage: str) -> Self:

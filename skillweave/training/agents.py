@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -23,7 +23,7 @@ from skillweave.algorithms.config import PPO, SAC, config_from_json
 from skillweave.buffers.recorded_steps import RecordedSteps
 from skillweave.envs.checked import longest_evaluation
 from skillweave.envs.engine import Engine
-from skillweave.errors import DeclarationError, RunError
+from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.experience.acting import Acting, Request
 from skillweave.experience.collector import FIRST_INFO, Collector
 from skillweave.experience.group import CollectorGroup
@@ -32,10 +32,11 @@ from skillweave.ops.threads import torch_threads
 from skillweave.policies.core import Array
 from skillweave.policies.untrusted import shown
 from skillweave.runs.initial_policies import initial_policy
-from skillweave.runs.manifest import StageEntry, Start
+from skillweave.runs.manifest import GivenScore, StageEntry, Start
 from skillweave.schema import fit
 from skillweave.spaces import is_continuous
 from skillweave.training.episodes import Episodes, Tick
+from skillweave.training.given import FEWEST, compared, looks, score
 from skillweave.training.joint import JointLearner
 from skillweave.training.keep_best import KeepBest
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
@@ -392,6 +393,7 @@ class Agents:
         log = self.log
         steps = self.loop.at.steps
         made = self.collectors.steps_made
+        self._score_given()
         self._evaluate_start()
         self.loop.run()
         if self.loop.ended:
@@ -414,8 +416,64 @@ class Agents:
             for path, stack in self.stacks().items():
                 stack.state = state_to(self.best.states[path], stack.state.params.device)
             log.kept_best(best, self.best.of)
+        self._compare_with_given()
         self._report_little_learnt()
         return self.policies()
+
+    def _score_given(self) -> None:
+        """Score the policy that the only learner was given, before the first update.
+
+        Where nobody has said which weights to keep, it is evaluated a few times while it trains.
+        """
+        log, entry = self.log, self.entry
+        if self.together is not None or not any(map(self._given, self.algorithms)):
+            return
+        new = bool(entry.starts) and not log.at.steps and not entry.continued
+        if new and log.at.given is None:
+            log.at.given = self._score()
+        keep = log.run.manifest.keep
+        if log.at.given is None or keep is not None:
+            return
+        self.best.wanted = True
+        every, episodes = looks(log.at.given, entry.budget)
+        if every and log.run.manifest.eval_every is None:
+            with suppress(SkillweaveError):  # only one environment may exist
+                self.evaluation = PeriodicEvaluation(
+                    self.task, self.stage.seeds, every, episodes, entry.num_envs
+                )
+                self._resources.callback(self.evaluation.close)
+
+    def _score(self, like: GivenScore | None = None) -> GivenScore | None:
+        """Score the present policy of the only learner; None: no environment can be made for it."""
+        (policy,) = self.policies().values()
+
+        def play(engine: Engine, seeds: Seeds, longest: int, greedy: bool) -> Array:
+            """Play an episode in each environment."""
+            who = self.task.who
+            return episodes_of(policy, who, engine, seeds, greedy=greedy, longest=longest)
+
+        try:
+            engine = self.task.engine(FEWEST)
+        except SkillweaveError as error:
+            self.log.message(f"what it was given is not scored: {error}")
+            return None
+        try:
+            found = score(engine, play, self.stage.seeds / "given", self.entry.budget, like)
+            self.log.at.evaluation_steps += engine.steps_made
+        finally:
+            engine.close()
+        return found if found.returns else None
+
+    def _compare_with_given(self) -> None:
+        """Compare what was learnt with the policy that was given, and keep that if it is better."""
+        log, given = self.log, self.log.at.given
+        if given is None or (now := self._score(given)) is None:
+            return
+        self.entry.kept = compared(given, now, log.run.manifest.keep != "last")
+        log.message(str(self.entry.kept))
+        if self.entry.kept.kept == "given":
+            for path, stack in self.stacks().items():
+                stack.state = state_to(self._initial_state(path), stack.state.params.device)
 
     def _evaluate_start(self) -> None:
         """Evaluate initial policies that were learnt elsewhere: the best weights may be theirs."""

@@ -37,10 +37,13 @@ class TrainDefaults:
     """Episodes of each of these evaluations."""
     checkpoint_every: AtLeastOne = 100_000
     """Environment steps between checkpoints."""
-    keep: Literal["last", "best"] = "last"
+    keep: Literal["last", "best"] | None = None
     """"best": each stage ends with the weights whose periodic evaluation was best, by the mean
     return or by what its target is of; the last weights are evaluated, too. It needs
-    ``eval_every``. A population ends with its best member in any case."""
+    ``eval_every``. "last": the last weights. None: "last"; but a stage whose policy was given ends
+    with the best ones, by a few evaluations where these take at most a tenth of its steps, and with
+    what it was given where the result is clearly worse. A population ends with its best member in
+    any case."""
     log_info: InfoKeys = ()
     """Keys of ``info``: the mean of each over the latest 100 episodes is ``info/<key>`` in
     ``metrics.jsonl`` and in trackers. Each episode counts with the value in its last step (in a

@@ -119,14 +119,19 @@ def episodes_of(
     seeds: Seeds,
     first: int = 0,
     count: int | None = None,
+    *,
+    greedy: bool = True,
+    longest: int | None = None,
 ) -> Array:
-    """Play one greedy episode in each environment; return rows like ``Collected.episodes``.
+    """Play one episode in each environment; return rows like ``Collected.episodes``.
 
     Args:
         who: acts, by this policy.
         first: the number of the first episode. An episode's start depends on its number alone, so
             several rounds in few environments have the same starts as one round in many.
         count: the number of environments, the first of ``engine``; None: all.
+        greedy: the policy does not sample.
+        longest: steps after which an episode is cut; None: by the environment's time limit.
 
     Returns:
         (n, 4), n at least 1; environments in which a skill could never start are left out.
@@ -141,8 +146,8 @@ def episodes_of(
     player = Collector(engine, Acting([(algorithm, 1)], engine.num_envs), who)
     params = algorithm.acting_params_of(policy.weights)
     gamma = np.array([algorithm.config.gamma])
-    request = Request(0, (params,), gamma, acting_seeds, greedy=True)
-    longest = longest_evaluation(engine.time_limit)
+    request = Request(0, (params,), gamma, acting_seeds, greedy=greedy)
+    longest = longest or longest_evaluation(engine.time_limit)
     # Several threads wait for each other, forever on a busy machine.
     with torch_threads(1), global_generators(global_seeds):
         episodes: Array = player.play(request, seeds / "start", longest)

@@ -156,7 +156,9 @@ class Stage:
         )
 
 
-def check_stages(entries: Sequence[StageEntry], eval_every: int | None, keep: str = "last") -> None:
+def check_stages(
+    entries: Sequence[StageEntry], eval_every: int | None, keep: str | None = None
+) -> None:
     """Raise a DeclarationError where the settings of a manifest's stages do not fit together."""
     alone = any(entry.evolution is None for entry in entries)
     if keep == "best" and eval_every is None and alone:
