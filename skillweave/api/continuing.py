@@ -150,7 +150,7 @@ def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
     for entry in grown:
         _check_grows(run, entry, more[entry.name])
     for entry in grown:
-        entry.budget += more[entry.name]
+        entry.budget = (entry.extended or entry.budget) + more[entry.name]
         if entry.done:
             entry.continued = [*entry.continued, entry.steps or 0]
             entry.forget_end()

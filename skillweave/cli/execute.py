@@ -223,6 +223,8 @@ def run_lines(manifest: Manifest, saved: Iterable[SavedEvaluation], target: obje
         if stage.continued:
             steps = ", ".join(f"{k:,}" for k in stage.continued)
             lines.append(f"    continued after {steps} steps")
+        if stage.extended is not None:
+            lines.append(f"    up to {stage.extended:,} steps, as it acted seldom")
         if (reached := stage.reached) is not None and stage.target is not None:
             lines.append(
                 f"    target reached after {reached.steps:,} of {stage.budget:,} steps: "

@@ -113,7 +113,7 @@ def _repaired(
             f"{shown_path(source)} was loaded without its code, and training needs that: load it "
             "with the hierarchy that was trained: sw.load(directory, hierarchy)"
         )
-    config = alone(learnt.algorithm.config)
+    config = alone(_settings(roles[skill].config, learnt))
     name = _stage_name(skill, {e.name for e in content.stages} | set(roles.skills))
     recorded = config_to_json(config)
     entry = StageEntry(name, "skill", [skill], None, steps, recorded, None, "waiting")
@@ -156,6 +156,15 @@ def _repaired(
 
     content = replace(content, stages=[*content.stages, entry], code=roles.code)
     return start_run(declared, content, options.training, reason, write, done)
+
+
+def _settings(declared: Any, learnt: AgentPolicy) -> Any:
+    """Return the settings by which a skill was declared to learn, with the networks that it has."""
+    has: Any = learnt.algorithm.config
+    if type(has) is not type(declared):
+        return has
+    networks = {k: getattr(has, k) for k in ("network", "critic") if hasattr(has, k)}
+    return replace(declared, **networks)
 
 
 def _resume_repair(

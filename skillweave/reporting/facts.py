@@ -116,6 +116,8 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
         notes = []
         if entry.continued:
             notes.append(f"continued after {', '.join(f'{k:,}' for k in entry.continued)} steps")
+        if entry.extended is not None:
+            notes.append(f"up to {entry.extended:,} steps, as it acted seldom")
         if entry.reached is not None:
             notes.append(f"target reached after {entry.reached.steps:,} steps")
         if entry.stopped is not None:

@@ -11,17 +11,23 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave._internal.messages import short
-from skillweave.api import Hierarchy, Run
+from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.config import config_from_json
+from skillweave.api import Hierarchy, Run, run_of
+from skillweave.api.running import start_run
+from skillweave.api.train_options import TrainOptions
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
+from skillweave.hierarchy import training
+from skillweave.hierarchy.roles import roles_of
 from skillweave.policies.core import Array, Step
 from skillweave.robots.aims import Aim
 from skillweave.robots.trial import RobotTrial
 from skillweave.robots.variation import Variation, with_settings
+from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Residual, Skill
 
-BEGIN = 2_048
-"""Steps in which the correction begins: it is zero at first, and hardly other afterwards."""
 KINDS = 16
 """The robots among which an episode of training chooses."""
 
@@ -108,14 +114,34 @@ def learn_on(
         spec,
         skills,
         selector=lambda obs: [skill] * len(obs),
-        steps=BEGIN,
+        learn="apart",
+        steps=1,
         name=f"{skill}-after-{after}",
     )
-    begun = hierarchy.train(run_dir, seed=seed, quiet=True)
+    begun = untrained(hierarchy, skill, run_dir, seed)
     repaired = None if run_dir is None else f"{run_dir}-repaired"
     return begun.repair(
         skill, after=after, steps=steps, calls=calls, run_dir=repaired, seed=seed, quiet=quiet
     )
+
+
+def untrained(hierarchy: Hierarchy, skill: str, run_dir: str | Path | None, seed: int) -> Run:
+    """Return a run in which a skill's correction is exactly zero: it acts as what it corrects."""
+    content = training.manifest(hierarchy, seed=seed)
+    (stage,) = content.stages
+    stage.status, stage.steps, stage.seconds = "done", 0, 0.0
+    role = roles_of(hierarchy)[skill]
+    algorithm: Any = make_algorithm(config_from_json(stage.algorithm), *role.spaces)
+    weights = algorithm.weights(algorithm.init([Seeds(seed) / skill]))
+    for kind in ("weight", "bias"):
+        weights[f"{algorithm.actor_net.head}.{kind}"].zero_()
+
+    def write(run: RunDirectory) -> None:
+        """Write the policy of the stage, which counts as done."""
+        run.save_policies(stage.name, {skill: AgentPolicy(algorithm, weights)})
+
+    options = TrainOptions(run_dir, seed=seed, quiet=True)
+    return run_of(start_run(hierarchy, content, options, repair=write))
 
 
 def declared(

@@ -332,6 +332,8 @@ class StageEntry:
     """Initial policies from other runs, by learner."""
     repair: RepairEntry | None = None
     """The stage repairs a skill that has learnt before."""
+    extended: NoSetting[AtLeastOne | None] = None
+    """The steps that it was allowed beyond its budget, as its skill acts seldom."""
     continued: NoSetting[list[Count]] = field(default_factory=list)
     """Steps after which the stage had ended, before its budget was raised."""
     metrics_bytes: NoSetting[Count | None] = None
@@ -563,6 +565,8 @@ class Checkpoint:
     population: Generation | None = None
     given: GivenScore | None = None
     """The score of the policy that the stage was given."""
+    budget: AtLeastOne | None = None
+    """The steps of a skill that acts seldom; None: those of its entry."""
 
     @classmethod
     def start(cls, stage: str) -> Self:

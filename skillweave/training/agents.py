@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
@@ -57,7 +58,14 @@ CRITIC_FEWEST, CRITIC_MOST, CRITIC_SHARE = 5, 20, 0.2
 most, and the most of a stage's budget that they take. By the advantages of a critic that has learnt
 nothing the first updates would undo the policy."""
 EARLY = 0.25
-"""Share of a stage's budget after which skills without a call are reported."""
+"""Share of a stage's budget after which skills without a call are reported, and a skill that acts
+seldom gets more steps."""
+FEW = 10
+"""Updates below which a learner has learnt little from its budget."""
+LARGEST_FACTOR = 4.0
+"""The most steps of a skill that acts seldom, as a multiple of its budget."""
+SELDOM = 0.5
+"""The share of steps below which a skill acts seldom."""
 
 
 class Agents:
@@ -209,7 +217,7 @@ class Agents:
             self.collectors,
             Episodes(self.task.log_info),
             self.stage.seeds,
-            self.entry.budget,
+            self.entry.budget if self.entry.continued else log.at.budget or self.entry.budget,
             LoopState(log.at.update, log.at.steps, log.at.seconds),
             checkpoint_every=log.run.manifest.checkpoint_every,
             on_tick=self._on_tick,
@@ -408,6 +416,7 @@ class Agents:
             self._save_final(spent=True)
             if self.entry.kind == "skill" and self._is_unchanged():
                 log.report_learnt_nothing()
+            self._report_few_updates()
         log.report_episodes(self.loop.episodes.tally, over=True)
         self.collectors.finish()
         if isinstance(self.learner, ReplayLearner):
@@ -490,12 +499,13 @@ class Agents:
         """Evaluate where it is due, and write a report; end at the target, or for a callback."""
         log = self.log
         best = self.best
-        budget = self.entry.budget
+        budget = self.loop.budget
         log.report_reset(self.collectors.restarts, self.collectors.num_envs)
         self.collectors.restarts = 0
         log.report_episodes(self.loop.episodes.tally, over=False)
         if tick.since < EARLY * budget <= tick.steps:
             self._report_not_called(tick.steps)
+            self._extend(tick.steps)
         # If the best weights count, the last ones must be evaluated, too.
         last = best.wanted and tick.steps >= budget
         evaluation = self.evaluation.due(tick.since, tick.steps, self.play, also=last)
@@ -542,6 +552,44 @@ class Agents:
         before = AgentPolicy.of(policy.algorithm, self._initial_state(name)).weights
         return all(torch.equal(policy.weights[k], before[k]) for k in before)
 
+    def _extend(self, steps: int) -> None:
+        """Give a skill that acts seldom up to four times its steps, so that it can learn."""
+        log, entry, learner = self.log, self.entry, self.learner
+        if not isinstance(learner, RolloutLearner) or not learner.quota or log.at.budget:
+            return
+        if entry.kind != "skill" or entry.repair is not None or entry.continued:
+            return
+        rollout = int(learner.stacks[0].algorithm.config.n_steps) * entry.num_envs
+        expected = learner.rows / learner.quota * entry.budget / steps
+        if expected >= FEW or entry.budget < FEW * rollout:  # else its budget itself is small
+            return
+        factor = min(LARGEST_FACTOR, FEW / max(expected, 1e-9))
+        self.loop.budget = log.at.budget = math.ceil(factor * entry.budget)
+        log.message(
+            f"it acted in {learner.rows:,} of {steps:,} steps, so it would learn from "
+            f"{expected:.0f} rollouts in {entry.budget:,} steps, which is too few: it takes up to "
+            f"{self.loop.budget:,} steps"
+        )
+
+    def _report_few_updates(self) -> None:
+        """Report that the only learner was updated a few times only, and why."""
+        learner, steps = self.learner, self.log.at.steps
+        if not isinstance(learner, RolloutLearner) or not 0 < learner.updates < FEW:
+            return
+        rollout = int(learner.stacks[0].algorithm.config.n_steps) * self.entry.num_envs
+        if self.entry.kind == "skill" and learner.rows < SELDOM * steps:
+            why = (
+                f"as it acted in {learner.rows:,} of these: give it more steps, widen its "
+                "initiation(), or let skills learn together"
+            )
+        else:
+            why = (
+                f"as each takes {rollout:,} (num_envs * n_steps): give it more steps, or lower "
+                "n_steps"
+            )
+        times = "once" if learner.updates == 1 else f"{learner.updates} times"
+        self.log.message(f"its policy was updated {times} only in {steps:,} steps, {why}")
+
     def _report_not_called(self, steps: int) -> None:
         """Report skills that were not called so far, while training can still be stopped."""
         counts = {} if self.joint is None else self.joint.counts
@@ -559,7 +607,13 @@ class Agents:
         for name, (rows, updates) in counts.items():
             if decides(name):
                 continue
-            if rows and not updates:
+            if updates and updates < FEW:
+                times = "once" if updates == 1 else f"{updates} times"
+                self.log.message(
+                    f"skill {name!r} acted in {rows:,} of {steps:,} steps, and its policy was "
+                    f"updated {times} only: lower together.quota or n_steps, or give more steps"
+                )
+            elif rows and not updates:
                 more = "raise together.epsilon, " if self.entry.decides in counts else ""
                 self.log.message(
                     f"skill {name!r} acted in {rows:,} of {steps:,} steps only, too few "

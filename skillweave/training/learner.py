@@ -109,6 +109,11 @@ class RolloutLearner:
         policy was learnt without it: until it explains returns."""
         self.keeps_scaling = False
         """Observations stay scaled as for the policy that was given."""
+        self.rows = 0
+        """Rows so far, of a member."""
+        self.updates = 0
+        """Updates so far."""
+        self.quota = quota
         self._progress = 0.0  # at the start of the rollout, so that the first has the whole rate
         self._resumed: ActingParams | None = None  # of the first request after a checkpoint
 
@@ -130,7 +135,9 @@ class RolloutLearner:
         """Store a rollout, with the exploration noise of its acting policy."""
         params, self._progress = self._requested
         log_std = params.views.get("actor.log_std")
-        self._store.add(batches[""], None if log_std is None else log_std[:, None])
+        batch = batches[""]
+        self.rows += int(batch.own_rows.sum()) // self._stack.members
+        self._store.add(batch, None if log_std is None else log_std[:, None])
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
         """Make an update if the store has enough rows."""
@@ -148,6 +155,7 @@ class RolloutLearner:
         with torch.enable_grad():  # the user may have switched gradients off
             stack.state, report = stack.algorithm.update(stack.state, rollout, generators)
         metrics: dict[str, Tensor] = report.metrics
+        self.updates += 1
         if rollout.critic_alone:
             fewest, most = (max(0, updates - 1) for updates in self.critic_first)
             known = not fewest and float(metrics["explained_variance"].min()) > KNOWN
@@ -167,7 +175,8 @@ class RolloutLearner:
         params, _ = self._requested
         acting = prefixed("acting", params.state()) if requested else {}
         first = {"critic_first": torch.tensor(self.critic_first)} if any(self.critic_first) else {}
-        return self._store.state() | coef | acting | first
+        counts = {"counts": torch.tensor([self.rows, self.updates])}
+        return self._store.state() | coef | acting | first | counts
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """Restore the tensors of a checkpoint."""
@@ -175,6 +184,7 @@ class RolloutLearner:
         acting = unprefixed("acting", kept)
         self._resumed = acting_of(self._stack, acting) if acting else None
         self._store.load(kept, algorithm.observation_space, algorithm.codec)
+        self.rows, self.updates = kept["counts"].tolist()
         fewest, most = kept["critic_first"].tolist() if "critic_first" in kept else (0, 0)
         self.critic_first = fewest, most
         if self.reference is not None:

@@ -243,6 +243,7 @@ class StageLog:
             self.run.keep_final(entry.name)
         entry.status = "done"
         entry.steps = at.steps
+        entry.extended = None if entry.continued else at.budget
         entry.seconds = round(at.seconds, 3)
         self.run.record_lines(entry)  # so that a later stage notices removed lines
         entry.evaluation_steps = at.evaluation_steps
