@@ -201,7 +201,8 @@ class Agent(Trainable, PlainAgent):
             keep: "best": each stage ends with the weights whose periodic evaluation was best, by
                 the mean return or by what its target is of; the last weights are evaluated, too,
                 and policies that were given. It needs ``eval_every``. A population ends with its
-                best member in any case. By default "last".
+                best member in any case. By default "last"; where a policy was given, the best of a
+                few evaluations, and what was given where the result is clearly worse.
             log_info: keys of ``info``: the mean of each over the latest 100 episodes is
                 ``info/<key>`` in ``metrics.jsonl`` and in trackers. Each episode counts with the
                 value in its last step (in a skill's own stage, its call's). None, NaN and
@@ -413,7 +414,8 @@ class Hierarchy(Trainable, Declaration):
             keep: "best": each stage ends with the weights whose periodic evaluation was best, by
                 the mean return or by what its target is of; the last weights are evaluated, too,
                 and policies that were given. It needs ``eval_every``. A population ends with its
-                best member in any case. By default "last".
+                best member in any case. By default "last"; where a policy was given, the best of a
+                few evaluations, and what was given where the result is clearly worse.
             log_info: keys of ``info``: the mean of each over the latest 100 episodes is
                 ``info/<key>`` in ``metrics.jsonl`` and in trackers. Each episode counts with the
                 value in its last step (in a skill's own stage, its call's). None, NaN and
@@ -1279,7 +1281,8 @@ def train_agent(
         keep: "best": each stage ends with the weights whose periodic evaluation was best, by
             the mean return or by what its target is of; the last weights are evaluated, too,
             and policies that were given. It needs ``eval_every``. A population ends with its
-            best member in any case. By default "last".
+            best member in any case. By default "last"; where a policy was given, the best of a
+            few evaluations, and what was given where the result is clearly worse.
         log_info: keys of ``info``: the mean of each over the latest 100 episodes is
             ``info/<key>`` in ``metrics.jsonl`` and in trackers. Each episode counts with the
             value in its last step (in a skill's own stage, its call's). None, NaN and

@@ -152,6 +152,7 @@ def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
     for entry in grown:
         entry.budget = (entry.extended or entry.budget) + more[entry.name]
         if entry.done:
+            entry.careful = _became_better(run, entry)
             entry.continued = [*entry.continued, entry.steps or 0]
             entry.forget_end()
     if grown:
@@ -159,6 +160,16 @@ def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
         for path in run.path.glob(EVALUATIONS):
             path.unlink()
     return sentences + _stale(stages, grown)
+
+
+def _became_better(run: RunDirectory, entry: StageEntry) -> bool:
+    """Return whether the latest evaluation of a stage was better than its first one."""
+    returns = [
+        line["eval_return"]
+        for line in run.metrics()
+        if line.get("stage") == entry.name and "eval_return" in line
+    ]
+    return len(returns) > 1 and returns[-1] > returns[0]
 
 
 def _heir(stages: Sequence[StageEntry], entry: StageEntry) -> StageEntry:

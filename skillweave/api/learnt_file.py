@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from skillweave._internal.messages import short, shown_path, suggest
+from skillweave._internal.notices import notice
 from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.errors import DeclarationError, RunError
@@ -56,7 +57,11 @@ def learnt_file(path: Path, roles: Roles, policy: Policy, skill: Any) -> bytes:
     assert isinstance(policy, HierarchyPolicy)
     learnt = parts_of(roles, policy)[skill]
     assert isinstance(learnt, AgentPolicy)
-    data = file_at_start(RunDirectory.open(path), skill)
+    run = RunDirectory.open(path)
+    for stage in run.manifest.stages:
+        if skill in stage.learns and stage.kept is not None and stage.kept.is_worse:
+            notice(f"save_onnx(): {skill!r} is clearly worse than its file: {stage.kept}")
+    data = file_at_start(run, skill)
     before = read_network(data, file.output, file.name).layers
     layers = _layers(learnt, before)
     part = own_parts_of(roles, policy)[skill]

@@ -52,14 +52,19 @@ class Comparison:
     """The share of episodes in which the policy that was given succeeded; None: unknown."""
     success: float | None = None
     """The same of the one that learnt on."""
-    worse: bool = False
+    worse: Literal[True] | None = None
     """What learnt on from a policy that was given is clearly worse."""
-    samples_better: bool = False
+    samples_better: Literal[True] | None = None
     """What learnt on is clearly better where it samples."""
     episodes: AtLeastOne | None = None
     """Episodes of each candidate; None: training was too short for a comparison."""
     sentence: str | None = None
     """The result of a repair, which is compared by calls."""
+
+    @property
+    def is_worse(self) -> bool:
+        """True if the policy that was kept is clearly worse than the one that was given."""
+        return bool(self.worse) and self.kept != "given"
 
     def __str__(self) -> str:
         """Return a sentence on the compared hierarchies and the kept one."""
@@ -90,7 +95,7 @@ class Comparison:
                 ": clearly worse, so the policy that was given is kept. Smaller steps may help "
                 '(learning_rate), or more steps; keep="last" ends with what it has learnt'
             )
-        elif self.worse:
+        elif self.is_worse:
             says = (
                 ': clearly worse than what it was given. Without keep="last" the policy that was '
                 "given would be kept; smaller steps may help (learning_rate), or more steps"

@@ -336,6 +336,8 @@ class StageEntry:
     """The steps that it was allowed beyond its budget, as its skill acts seldom."""
     continued: NoSetting[list[Count]] = field(default_factory=list)
     """Steps after which the stage had ended, before its budget was raised."""
+    careful: NoSetting[bool] = False
+    """Its evaluations had become better when it was continued, so it learns on by small steps."""
     metrics_bytes: NoSetting[Count | None] = None
     lineage_bytes: NoSetting[Count | None] = None
     reached: NoSetting[Reached | None] = None

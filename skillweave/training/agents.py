@@ -21,6 +21,7 @@ from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm, stat
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.batches import Reference
 from skillweave.algorithms.config import PPO, SAC, config_from_json
+from skillweave.algorithms.schedules import start_rate
 from skillweave.buffers.recorded_steps import RecordedSteps
 from skillweave.envs.checked import longest_evaluation
 from skillweave.envs.engine import Engine
@@ -147,7 +148,8 @@ class Agents:
     def _config(self, name: str) -> Any:
         """Return a learner's settings, with the networks that it has grown in a population."""
         config: Any = config_from_json(self.entry.algorithms.get(name, self.entry.algorithm))
-        if isinstance(config, PPO | SAC) and self._given(name) is not None:
+        learns_on = self.entry.careful or self._given(name) is not None
+        if isinstance(config, PPO | SAC) and learns_on:
             config = config.learning_on(continuous=is_continuous(self.roles[name].spaces[1]))
         earlier = self.stage.policies.get(name)
         if not isinstance(earlier, AgentPolicy):
@@ -264,6 +266,9 @@ class Agents:
                     learner.begin_with(rows)
         if isinstance(learner, RolloutLearner):
             learner.reference = reference
+            if self.entry.careful and self.log.at.steps == self.entry.continued[-1]:
+                rate = learner.stacks[0].state.learning_rate
+                rate.fill_(start_rate(algorithm.config))
             first = name == self.entry.decides
             keep_to_guide(learner, self.entry.guide_kl if first else self.roles[name].guide_kl)
             rehearse(learner, self.log.run, self.entry, self.stage.policies.get(name))

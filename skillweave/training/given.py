@@ -99,8 +99,8 @@ def compared(given: GivenScore, now: GivenScore, keeps_given: bool) -> Compariso
         given_success=_mean(given.success),
         success=_mean(now.success),
         episodes=max(1, len(now.returns)),
-        worse=worse,
-        samples_better=_is_worse(now.returns, now.sampled),
+        worse=True if worse else None,
+        samples_better=True if _is_worse(now.returns, now.sampled) else None,
     )
 
 

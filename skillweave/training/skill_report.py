@@ -454,11 +454,18 @@ def useless_skills(
         elif report.cannot_last:
             sentences.append(instant_calls(name, report))
         elif report.succeeded == 0:
-            advice = (
-                "Give it more steps or longer calls (call_steps), or a reward that leads there"
-                if report.learns
-                else f"Give it longer calls (call_steps), or let it learn: {learn_on(name)}"
-            )
+            if not report.learns:
+                advice = f"Give it longer calls (call_steps), or let it learn: {learn_on(name)}"
+            elif report.has_goals:
+                advice = (
+                    f"See how many goals of its own it reaches, evaluate(skill={name!r}): if many, "
+                    "the goals that were chosen here are out of its reach, or take longer calls "
+                    "(call_steps); if few, give it more steps, or a reward that leads there"
+                )
+            else:
+                advice = (
+                    "Give it more steps or longer calls (call_steps), or a reward that leads there"
+                )
             sentences.append(
                 f"None of {report.calls:,} calls of skill {name!r} ended with success() true. "
                 f"{advice}."

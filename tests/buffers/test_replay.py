@@ -294,7 +294,7 @@ def test_samples_are_on_the_learners_device():
                   np.random.default_rng(0), masked=1.0)  # fmt: skip
     store.add(5)
     sample = store.store.sample(4, GAMMA[:1], generators(1))
-    others = ("index", "progress", "env_reward")
+    others = ("index", "progress", "env_reward", "critic_alone")
     tensors = [getattr(sample, f.name) for f in fields(Sample) if f.name not in others]
     assert {x.device.type for x in tensors} == {"meta"}
     assert isinstance(sample.index, np.ndarray)
