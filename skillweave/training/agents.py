@@ -422,6 +422,7 @@ class Agents:
             if self.entry.kind == "skill" and self._is_unchanged():
                 log.report_learnt_nothing()
             self._report_few_updates()
+        self._report_expectations()
         log.report_episodes(self.loop.episodes.tally, over=True)
         self.collectors.finish()
         if isinstance(self.learner, ReplayLearner):
@@ -575,6 +576,14 @@ class Agents:
             f"{expected:.0f} rollouts in {entry.budget:,} steps, which is too few: it takes up to "
             f"{self.loop.budget:,} steps"
         )
+
+    def _report_expectations(self) -> None:
+        """Report critics that expect far more than was ever paid."""
+        metrics = self.log.at.metrics
+        for name, learner in self.learners.items():
+            own = metrics if self.joint is None else unprefixed(name, metrics)
+            if isinstance(learner, ReplayLearner) and (says := learner.expects_too_much(own)):
+                self.log.message(says if self.joint is None else f"{name}: {says}")
 
     def _report_few_updates(self) -> None:
         """Report that the only learner was updated a few times only, and why."""

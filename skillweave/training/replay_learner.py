@@ -14,6 +14,7 @@ from torch import Tensor
 
 from skillweave._internal.prefixes import prefixed, unprefixed
 from skillweave._internal.seeding import Seeds
+from skillweave.algorithms.actor_critic import ActorCriticAlgorithm
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.batches import OF_STEP, Batch, RawRows
 from skillweave.algorithms.config import JUDGES_AGAIN, is_offline
@@ -28,6 +29,7 @@ from skillweave.ops.device import resolve_device
 from skillweave.policies.core import Array
 from skillweave.spaces import to_tensor
 from skillweave.training.learner import Stack, acting_of, member_seeds
+from skillweave.training.paid_returns import ENOUGH, FARTHEST, PaidReturns
 from skillweave.training.role import Role
 
 DRAWN_AT_ONCE = 8
@@ -112,6 +114,8 @@ class ReplayLearner:
         self._learns_from = self._random_until + (0 if len(store) else goes_on_at)
         self._transitions = np.zeros(2)  # of a member: at the latest update, and now
         self._returns: Array | None = None  # (N,), the open episodes' discounted returns
+        self.paid = PaidReturns(store.num_envs)
+        """What its episodes have paid; a learner that goes on counts again."""
         self._acting: tuple[ActingParams, ...] = ()  # of the latest request
         self._resumed: tuple[ActingParams, ...] = ()  # of the first request after a checkpoint
         self.keeps_scaling = False
@@ -158,6 +162,7 @@ class ReplayLearner:
         batch = batches[""]
         self.store.add(batch)
         self._transitions[1] += int(batch.own_rows.sum()) / self.members
+        self.paid.see(batch, self._gamma().repeat(self.store.num_envs // self.members))
         self._see(batch)
         if any(s.algorithm.scales_rewards for s in self.stacks):
             self._scale_returns(batch)
@@ -287,6 +292,7 @@ class ReplayLearner:
     def cut(self, columns: Array) -> None:
         """End the open trajectories of ``columns`` (k,)."""
         self.store.cut(columns)
+        self.paid.cut(columns)
         if self._returns is not None:
             self._returns[columns] = 0.0
 
@@ -322,6 +328,39 @@ class ReplayLearner:
         if saved := unprefixed("store", kept):
             self.store.load(saved)
             self._learns_from = self._random_until
+
+    def expects_too_much(self, metrics: Mapping[str, float]) -> str:
+        """Return a sentence where critics expect far more than was ever paid; else nothing.
+
+        Args:
+            metrics: the latest of its update.
+        """
+        if len(self.stacks) != 1 or self.members != 1 or self.paid.episodes < ENOUGH:
+            return ""
+        (stack,) = self.stacks
+        algorithm, state = stack.algorithm, stack.state
+        if not isinstance(algorithm, ActorCriticAlgorithm):
+            return ""
+        largest = max(self.paid.largest, float(state.end_pay[0]))
+        if not largest:
+            return ""
+        unit = float(algorithm.units(state)[1][0, 0])
+        far = 1.0 - float(state.gamma[0])
+        entropy = metrics.get("ent_coef", 0.0) * unit * max(0.0, metrics.get("entropy", 0.0))
+        if entropy > largest * far:
+            return (
+                f"its entropy is worth {entropy / far:.3g} in the long run (ent_coef "
+                f"{metrics['ent_coef']:.3g} for {metrics['entropy']:.3g} nats in each step), and "
+                f"the largest return of its {self.paid.episodes:,} episodes was {largest:.3g}, so "
+                "it rather stays random: lower ent_coef, SAC(ent_coef=0.05), or scale rewards up"
+            )
+        if abs(q := metrics.get("q", 0.0)) > FARTHEST * largest:
+            return (
+                f"its critics expect {q:.3g} on average, and the largest return of its "
+                f"{self.paid.episodes:,} episodes was {largest:.3g}: they overestimate. A lower "
+                "learning_rate, update_ratio or n_step may help"
+            )
+        return ""
 
     def _gamma(self) -> Array:
         """Return the discounts of all members, (P,) float32."""
