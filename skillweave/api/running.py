@@ -34,7 +34,11 @@ from skillweave.runs.command_words import called_by, resume_words, saved_words
 from skillweave.runs.directory import CUTS, First, RunDirectory
 from skillweave.runs.files import write_json
 from skillweave.runs.hub import must_be_own
-from skillweave.runs.initial_policies import Learnt, copy_initial_policies
+from skillweave.runs.initial_policies import (
+    Learnt,
+    compare_with_given,
+    copy_initial_policies,
+)
 from skillweave.runs.manifest import Manifest, identity
 from skillweave.runs.numbered import make_numbered
 from skillweave.runs.trackers import Listener, make_trackers
@@ -139,6 +143,8 @@ def start_run(
                 content = replace(content, data=data.steps.name)
                 check_room(content.stages, data.steps.room)
         learnt, origin = starts(content, start_from, roles) if repair is None else ({}, "")
+        if content.keep != "last":
+            compare_with_given(content.stages)
         first = repair or partial(_first_files, learnt=learnt, data=data)
         note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))
         make_trackers(options.track, None)  # a missing extra is reported before anything is written

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 from skillweave._internal.paths import join, level_of, levels_to
+from skillweave.algorithms.agent_policy import AgentPolicy
 from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.hierarchy.schedule import open_choices
@@ -67,18 +68,32 @@ def select_best(
         )
         scores = _scores(roles, level, run, before, after, episodes)
         means: dict[str, Any] = {name: score.mean for name, score in scores.items()}
-        entry.kept = Comparison(_best(scores), episodes=episodes, **means)
+        best = _best(scores)
+        if best == "before" and entry.starts:
+            # The run ends with what it was given, whose copies are not kept.
+            run.save_policies(entry.name, _of_stage(entry, before, after))
+        kept: Candidate = "given" if best == "before" and entry.starts else best
+        entry.kept = Comparison(kept, episodes=episodes, **means)
         played = sum(sum(score.lengths) for score in scores.values())
         entry.evaluation_steps = (entry.evaluation_steps or 0) + played
         run.save()
         course.tell(entry, str(entry.kept))
-        best = scores[entry.kept.kept].skills
+        skills = scores[best].skills
         learns = level.ready_selector is None
         hints = _exploration(entry, scores) if learns else []
-        for hint in hints or useless_skills(best, episodes, selector_learns=learns):
+        for hint in hints or useless_skills(skills, episodes, selector_learns=learns):
             for listener in course.listeners:
                 listener.message(hint)
+        run.drop_used(entry)
+        if kept == "given":
+            return before
     return before if entry.undone else after
+
+
+def _of_stage(entry: StageEntry, before: Policies, after: Policies) -> dict[str, AgentPolicy]:
+    """Return the policies of a stage's learners before it; a critic may be of after it alone."""
+    policies = {name: before.get(name, after[name]) for name in entry.learns}
+    return {name: policy for name, policy in policies.items() if isinstance(policy, AgentPolicy)}
 
 
 def _episodes(entry: StageEntry) -> int:
@@ -197,6 +212,6 @@ def _sampling(run: RunDirectory, path: str) -> tuple[bool, bool]:
             if entry.needs_comparison:
                 continue
             return True, False  # not evaluated: skills act as they did while the selector learnt
-        if (choice := entry.kept.kept) != "before":
+        if (choice := entry.kept.kept) not in ("before", "given"):
             return SAMPLING[choice]
     return False, False

@@ -22,7 +22,12 @@ from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.command_words import repair_words, resume_words
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.initial_policies import copy_file, copy_ready_policy, policy_at_start
+from skillweave.runs.initial_policies import (
+    copy_file,
+    copy_ready_policy,
+    given_policies,
+    policy_at_start,
+)
 from skillweave.runs.manifest import Manifest
 from skillweave.runs.trackers import Listener
 from skillweave.skills import ready_policy
@@ -126,7 +131,8 @@ def train(
         policies = course.train(apart, policies)
         if len(apart) < len(stages):
             after = course.train(stages[len(apart) :], policies)
-            policies = select_best(roles, level, course, policies, after)
+            before = {**policies, **given_policies(run, stages[-1].name)}
+            policies = select_best(roles, level, course, before, after)
     roles = resolve_greedy(roles, run)
     policy = assembled(roles, _repaired(roles, course, policies))
     check_parts(roles, policy, str(run.path))

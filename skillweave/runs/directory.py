@@ -521,8 +521,9 @@ class RunDirectory:
         for name in entry.learns:
             if not self.learns_again(entry.name, name):
                 self.remove("states", name)
-        for name in entry.starts:
-            self.remove("starts", name)
+        if entry.kept is not None or not entry.needs_comparison:
+            for name in entry.starts:
+                self.remove("starts", name)
         if entry.repair is not None and entry.repair.rehearsal is not None:
             self.remove("starts", entry.name)
 

@@ -6,11 +6,11 @@ They are copied when the run begins, so it does not depend on other runs and fil
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from skillweave._internal.paths import SELECTOR, decides, level_of, name_of
+from skillweave._internal.paths import CRITIC, SELECTOR, decides, level_of, name_of
 from skillweave._internal.policy_protocol import Policy
 from skillweave.algorithms.agent_policy import AgentHeader, AgentPolicy
 from skillweave.algorithms.base import Algorithm
@@ -130,6 +130,16 @@ def record_initial_policies(
     return started
 
 
+def compare_with_given(stages: Sequence[StageEntry]) -> None:
+    """Let stages in which all learn together be compared with the policies that all were given."""
+    earlier: set[str] = set()
+    for entry in stages:
+        acts = {name for name in entry.learns if name_of(name) != CRITIC}
+        if entry.kind == "together" and entry.starts and acts <= earlier | set(entry.starts):
+            entry.compared = True
+        earlier |= set(entry.learns)
+
+
 def copy_initial_policies(run: RunDirectory, learnt: Mapping[str, Learnt]) -> None:
     """Copy the initial policies of a new run's stages into it: all, or nothing.
 
@@ -159,6 +169,27 @@ def initial_policy(
     start = run.stage(stage).starts.get(name)
     if start is None:
         return None
+    policy = _given(run, name, start)
+    if policy.algorithm.weight_shapes() != algorithm.weight_shapes():
+        raise RunError(
+            f"{run.file('starts', name)} holds other networks than {name!r} has in this run"
+        )
+    return policy, start.steps
+
+
+def given_policies(run: RunDirectory, stage: str) -> dict[str, AgentPolicy]:
+    """Return the policies that a stage's learners were given, by name, while the run has copies.
+
+    Raises:
+        RunError: the run's copy of one is missing, damaged, or belongs to another run.
+    """
+    entry = run.stage(stage)
+    starts = entry.starts if entry.needs_comparison and entry.kept is None else {}
+    return {name: _given(run, name, start) for name, start in starts.items()}
+
+
+def _given(run: RunDirectory, name: str, start: Start) -> AgentPolicy:
+    """Return a run's copy of an initial policy."""
     path = run.file("starts", name)
     if not path.exists():
         raise RunError(
@@ -169,10 +200,7 @@ def initial_policy(
     if header.get("kind") != "agent" or header.get("starts") != name:
         raise RunError(f"{path} does not hold the initial policy of {name!r}")
     check_unchanged(path, header, start.copy)
-    policy = AgentPolicy.from_file(tensors, record_in(AgentHeader, header, path), str(path))
-    if policy.algorithm.weight_shapes() != algorithm.weight_shapes():
-        raise RunError(f"{path} holds other networks than {name!r} has in this run")
-    return policy, start.steps
+    return AgentPolicy.from_file(tensors, record_in(AgentHeader, header, path), str(path))
 
 
 def copy_ready_policy(run: RunDirectory, skill: str, policy: Policy) -> None:

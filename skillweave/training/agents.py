@@ -484,7 +484,9 @@ class Agents:
         log, given = self.log, self.log.at.given
         if given is None or (now := self._score(given)) is None:
             return
-        self.entry.kept = compared(given, now, log.run.manifest.keep != "last")
+        # A stage that was continued has no copy of what it was given any more.
+        keeps = log.run.manifest.keep != "last" and not self.entry.continued
+        self.entry.kept = compared(given, now, keeps)
         log.message(str(self.entry.kept))
         if self.entry.kept.kept == "given":
             for path, stack in self.stacks().items():

@@ -183,3 +183,44 @@ def test_evaluations_that_nobody_asked_for_cost_a_tenth_at_most() -> None:
     every, episodes = looks(score([1.0]), 10_000)
     assert (every, episodes) == (2_500, 20)
     assert looks(score([1.0]), 1_999) == (0, 0)  # five episodes of ten steps, four times
+
+
+class Follow(sw.Skill):
+    """Does what pays."""
+
+    max_steps = 5
+
+
+class Against(sw.Skill):
+    """Does what does not."""
+
+    max_steps = 5
+
+    def reward(self, step: sw.Step) -> Any:
+        return -step.reward
+
+
+def test_a_hierarchy_that_was_given_whole_is_kept_and_can_be_given_again(tmp_path: Path) -> None:
+    good = sw.PPO(num_envs=4, n_steps=32, network=SMALL)
+
+    def declare(algorithm: Any, steps: int) -> sw.Hierarchy:
+        skills = [Follow(), Against()]
+        how: Any = {"algorithm": algorithm, "selector": algorithm, "learn": "together"}
+        return sw.Hierarchy(Side, skills, steps=steps, call_steps=5, **how)
+
+    first = declare(good, 16_000).train(tmp_path / "first", seed=0, quiet=True)
+    assert first.evaluate(20).mean > 8.5
+    how: Any = {"seed": 1, "quiet": True}
+    wild = declare(WILD, 6_000).train(tmp_path / "wild", start_from=first, **how)
+    (stage,) = wild.info()["stages"]
+    assert stage["kept"]["kept"] == "given"
+    assert not (tmp_path / "wild" / "starts").exists()
+    assert wild.evaluate(20).mean > 8.5
+    loaded = sw.load(tmp_path / "wild", declare(WILD, 6_000))
+    assert loaded.evaluate(20).mean == wild.evaluate(20).mean
+    again = declare(good, 1_000).train(tmp_path / "again", start_from=wild, **how)
+    assert again.info()["stages"][0]["kept"]["before"] == pytest.approx(
+        stage["kept"]["before"], abs=1.0
+    )
+    last = declare(WILD, 6_000).train(tmp_path / "last", start_from=first, keep="last", **how)
+    assert last.evaluate(20).mean < 8.5
