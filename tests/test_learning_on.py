@@ -56,6 +56,7 @@ class StopAfter(Heard):
     """A listener that raises when a stage is done."""
 
     def __init__(self, stage):
+        super().__init__()
         self.at = stage
 
     def done(self, name, *told):

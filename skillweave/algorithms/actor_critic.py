@@ -17,7 +17,7 @@ from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.networks.config import Network
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, Views
-from skillweave.ops.device import BOOL, FLOAT, INT, all_false
+from skillweave.ops.device import FLOAT, INT, all_false
 from skillweave.ops.losses import critic_loss
 from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.spaces import ObsCodec
@@ -37,7 +37,7 @@ class ActorCriticState(OffPolicyState):
     critic_count: Tensor  # (P,) int64, or (P, K, D)
     policy_loss: Tensor  # (P,), the latest, for the metrics
     end_pay: Tensor  # (P,), the most that a terminal step has paid, at least 0
-    paid_before: Tensor  # (P,) bool, another step has paid or cost something
+    paid_before: Tensor  # (P,), 1 where another step has paid or cost something, else 0
 
 
 class ActorCriticAlgorithm(OffPolicyAlgorithm):
@@ -61,7 +61,7 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
         return super().fresh_fields(params) | {
             "policy_loss": torch.zeros(members, **FLOAT),
             "end_pay": torch.zeros(members, **FLOAT),
-            "paid_before": torch.zeros(members, **BOOL),
+            "paid_before": torch.zeros(members, **FLOAT),
         }
 
     def fresh_networks(self, seeds: Sequence[Seeds]) -> dict[str, Tensor]:
@@ -96,7 +96,8 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
         """Note which steps pay; where that changes the units, let critics keep their values."""
         ends = sample.discount == 0.0
         paid = torch.where(ends, sample.reward, 0.0).amax(1)
-        before = state.paid_before | ((sample.reward != 0.0) & ~ends).any(1)
+        other = ((sample.reward != 0.0) & ~ends).any(1)
+        before = state.paid_before.maximum(other.to(state.paid_before.dtype))
         most = state.end_pay.maximum(paid)
         if all_false((most != state.end_pay) | (before != state.paid_before)):
             return
@@ -120,7 +121,7 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
         usual = state.gamma.new_ones(len(state.gamma), 1) if scale is None else scale.reciprocal()
         if not self.follows_critics:
             return torch.zeros_like(usual), usual
-        pay = torch.where(state.paid_before, 0.0, state.end_pay)[:, None]
+        pay = torch.where(state.paid_before > 0.0, 0.0, state.end_pay)[:, None]
         unit = pay * (1.0 - state.gamma[:, None]).clamp_min(LEAST_STEP)
         return pay, torch.where(pay > 0.0, unit, usual)
 

@@ -187,7 +187,8 @@ class PPOAlgorithm(Algorithm):
                 terms.rehearsal = self._drawn(state, batch.rehearsal, size, rng)
             report, learns = learn(state, leaves, minibatch, terms, None if all_learn else active)
             if follows_kl and reports:  # before the first step there is nothing to measure
-                terms.rate = kl_adapted_rate(terms.rate, report["kl"], target, *self._rates)
+                adapted = kl_adapted_rate(terms.rate, report["kl"], target, *self._rates)
+                terms.rate = torch.where(active, adapted, terms.rate)
             reports.append(report)
             learnt.append(active)
             active = active if learns is None else learns

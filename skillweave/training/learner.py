@@ -19,6 +19,7 @@ from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.batches import Batch, Reference, Rehearsal
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.experience.acting import Request
+from skillweave.ops.device import INT
 from skillweave.policies.core import Array
 
 KNOWN = 0.5
@@ -174,8 +175,10 @@ class RolloutLearner:
         coef = {} if reference is None else {"reference_coef": reference.coef.cpu().clone()}
         params, _ = self._requested
         acting = prefixed("acting", params.state()) if requested else {}
-        first = {"critic_first": torch.tensor(self.critic_first)} if any(self.critic_first) else {}
-        counts = {"counts": torch.tensor([self.rows, self.updates])}
+        first = {}
+        if any(self.critic_first):
+            first = {"critic_first": torch.tensor(self.critic_first, **INT)}
+        counts = {"counts": torch.tensor([self.rows, self.updates], **INT)}
         return self._store.state() | coef | acting | first | counts
 
     def load(self, kept: dict[str, Tensor]) -> None:

@@ -66,7 +66,8 @@ class CriticsFirst:
 
     def tensor(self) -> Tensor:
         """Return its numbers, for a checkpoint."""
-        return torch.tensor([self.left, self.seen, self.total, self.before], dtype=torch.float64)
+        numbers = [self.left, self.seen, self.total, self.before]
+        return torch.tensor(numbers, dtype=torch.float64, device="cpu")
 
     @classmethod
     def of(cls, kept: Tensor) -> CriticsFirst:

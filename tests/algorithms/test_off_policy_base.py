@@ -188,7 +188,7 @@ def test_where_ends_alone_pay_critics_learn_the_cost_of_the_way(kind):
     algorithm, state = learner_of_ends(kind)
     paid = sample_of([0.0, 2.0, 0.0, 2.0 * 0.9], [0.9, 0.0, 0.81, 0.0])
     algorithm.update(state, paid, [Seeds(0).torch()])
-    assert (state.end_pay.item(), state.paid_before.item()) == (2.0, False)
+    assert (state.end_pay.item(), state.paid_before.item()) == (2.0, 0.0)
     # The last one: two steps to an end, of which the first cost 1.
     by_hand = torch.tensor([[-1.0, 0.0, -1.9, -1.0]])
     torch.testing.assert_close(algorithm.rewards(state, paid), by_hand)
@@ -213,7 +213,7 @@ def test_values_stay_where_other_rewards_change_the_units(kind, reward, discount
     before = value()
     assert before.std() > 1e-3
     algorithm._see_rewards(state, sample_of(reward, discount))
-    assert state.paid_before.item()
+    assert state.paid_before.item() == 1.0
     torch.testing.assert_close(value(), before)
     torch.testing.assert_close(
         algorithm.rewards(state, sample_of(reward, discount)), torch.tensor([reward])
