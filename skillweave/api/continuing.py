@@ -163,12 +163,17 @@ def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
 
 
 def _became_better(run: RunDirectory, entry: StageEntry) -> bool:
-    """Return whether the latest evaluation of a stage was better than its first one."""
-    returns = [
-        line["eval_return"]
-        for line in run.metrics()
-        if line.get("stage") == entry.name and "eval_return" in line
-    ]
+    """Return whether the latest evaluation of a stage was better than its first one.
+
+    False where there are none, or their file is damaged.
+    """
+    if run.manifest.eval_every is None:
+        return False
+    try:
+        lines = [line for line in run.metrics() if line.get("stage") == entry.name]
+    except RunError:
+        return False
+    returns = [line["eval_return"] for line in lines if "eval_return" in line]
     return len(returns) > 1 and returns[-1] > returns[0]
 
 
