@@ -12,7 +12,7 @@ from robots.test_handovers import VARY
 
 import skillweave as sw
 from skillweave.errors import DeclarationError
-from skillweave.robots.learning_on import KINDS, Varied, declared
+from skillweave.robots.learning_on import KINDS, Varied, declared, untrained
 from skillweave.robots.measuring import MeasuredHandovers
 from skillweave.robots.variation import Variation
 from skillweave.toys.balancer import Balancer
@@ -100,3 +100,29 @@ def test_episodes_of_training_are_each_of_a_robot_that_was_drawn() -> None:
         env.step(np.zeros(2, np.float32))
     assert 5 < len(set(grips)) <= KINDS
     env.close()
+
+
+@pytest.mark.needs("repair")
+def test_a_correction_that_has_learnt_nothing_is_exactly_zero(tmp_path: Path) -> None:
+    skills = policies()
+
+    class Wave(sw.Skill):
+        policy = sw.Residual(skills["wave"], scale=0.5)
+
+        def reward(self, step: sw.Step) -> Any:
+            return upright(step)
+
+    class Plain(sw.Skill):
+        name = "wave"
+        policy = skills["wave"]
+
+    def both(skill: sw.Skill) -> sw.Hierarchy:
+        choose = lambda obs: ["wave"] * len(obs)  # noqa: E731
+        return sw.Hierarchy(Balancer, [skill], selector=choose, learn="apart", steps=1)
+
+    run = untrained(both(Wave()), "wave", tmp_path / "run", seed=0)
+    assert run.info()["stages"][0]["steps"] == 0
+    plain = both(Plain()).train(tmp_path / "plain", seed=0, quiet=True)
+    one, other = (x.evaluate(10, seed=3) for x in (run, plain))
+    assert one.returns == other.returns
+    assert one.lengths == other.lengths
