@@ -7,8 +7,8 @@ does not import torch, so that ``--help`` and argument errors are instant.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, TypeAlias
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import gymnasium as gym
 
@@ -70,6 +70,14 @@ class OnPolicy:
     def __post_init__(self) -> None:
         check_critic(self)
         check_rate(self)
+
+    def learning_on(self, *, continuous: bool) -> Self:
+        """Return the settings by which a learner goes on from a policy that was given: these.
+
+        Args:
+            continuous: some numbers of an action are continuous.
+        """
+        return self
 
 
 @settings
@@ -152,7 +160,7 @@ class PPO(OnPolicy):
         """The approximate samples of a gradient step."""
         return self.batch_size or max(64, self.num_envs * self.n_steps // 8)
 
-    def learning_on(self, *, continuous: bool) -> PPO:
+    def learning_on(self, *, continuous: bool) -> Self:
         """Return the settings by which a learner goes on from a policy that was given.
 
         A policy that can do something is kept by small steps: the learning rate begins at 1e-4 and
@@ -162,13 +170,13 @@ class PPO(OnPolicy):
         Args:
             continuous: some numbers of an action are continuous.
         """
-        usual = type(self)()
+        usual = {f.name: f.default for f in fields(self)}
         changes: dict[str, Any] = {}
         rate = self.learning_rate, self.learning_rate_schedule
-        if rate == (usual.learning_rate, usual.learning_rate_schedule):
+        if rate == (usual["learning_rate"], usual["learning_rate_schedule"]):
             target = 0.01 if self.target_kl is None else self.target_kl
             changes = {"learning_rate": 1e-4, "learning_rate_schedule": "kl", "target_kl": target}
-        if continuous and self.ent_coef == usual.ent_coef and self.ent_coef_final is None:
+        if continuous and self.ent_coef == usual["ent_coef"] and self.ent_coef_final is None:
             changes["ent_coef"] = 0.0
         return replace(self, **changes)
 
@@ -370,6 +378,14 @@ class OffPolicy:
                 self, "prioritized", not self.prioritized, "False where it learns from data alone"
             )
 
+    def learning_on(self, *, continuous: bool) -> Self:
+        """Return the settings by which a learner goes on from a policy that was given: these.
+
+        Args:
+            continuous: some numbers of an action are continuous.
+        """
+        return self
+
 
 @settings
 class DQN(OffPolicy):
@@ -543,7 +559,7 @@ class SAC(ActorCritic):
     policy_delay: AtLeastOne = 1
     """Critic updates for each update of the actor."""
 
-    def learning_on(self, *, continuous: bool) -> SAC:
+    def learning_on(self, *, continuous: bool) -> Self:
         """Return the settings by which a learner goes on from a policy that was given.
 
         A learnt α begins at 0.1, unless ``ent_coef`` is not its default: at 1 entropy would be
@@ -552,8 +568,9 @@ class SAC(ActorCritic):
         Args:
             continuous: some numbers of an action are continuous.
         """
-        usual = self.learn_ent_coef and self.ent_coef == type(self)().ent_coef
-        return replace(self, ent_coef=0.1) if usual else self
+        usual = {f.name: f.default for f in fields(self)}
+        begins_high = self.learn_ent_coef and self.ent_coef == usual["ent_coef"]
+        return replace(self, ent_coef=0.1) if begins_high else self
 
 
 @settings
@@ -768,6 +785,12 @@ def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
     name = type(config).__name__
     advice = "record a name, and let the algorithm look up what it means"
     return {"algorithm": name, **to_json(config, name, advice)}
+
+
+def with_networks(config: Any, like: Any) -> Any:
+    """Return an algorithm's settings with the networks of others, which may have grown."""
+    networks = {k: getattr(like, k) for k in ("network", "critic") if hasattr(like, k)}
+    return replace(config, **networks)
 
 
 def alone(config: Any) -> Any:

@@ -214,11 +214,12 @@ class Collector:
         self.start(seeds)
         found = np.full((self.num_envs, FIRST_INFO + len(self.log_info)), np.nan)
         playing, unknown = np.ones(self.num_envs, bool), np.ones(self.num_envs, bool)
-        self._prepare(request)
         steps, self._ended = 0, []
         while steps < max_steps and playing.any():
             if not request.greedy:  # what it needs of chance is drawn for so many steps
                 self._prepare(replace(request, rows=PLAYED, seeds=request.seeds / steps))
+            elif not steps:
+                self._prepare(request)
             writer = self._writer(min(PLAYED, max_steps - steps))
             while writer.row < min(PLAYED, max_steps - steps) and playing.any():
                 self._step(writer)

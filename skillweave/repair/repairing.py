@@ -10,7 +10,7 @@ from typing import Any
 from skillweave._internal.messages import as_path, short, shown_path
 from skillweave._internal.paths import join, level_of, name_of
 from skillweave.algorithms.agent_policy import AgentPolicy
-from skillweave.algorithms.config import OnPolicy, alone, config_to_json
+from skillweave.algorithms.config import OnPolicy, alone, config_to_json, with_networks
 from skillweave.api import Hierarchy, Run, run_of
 from skillweave.api.applying import Trained, apply_manifest
 from skillweave.api.running import start_run, train_stages
@@ -161,10 +161,7 @@ def _repaired(
 def _settings(declared: Any, learnt: AgentPolicy) -> Any:
     """Return the settings by which a skill was declared to learn, with the networks that it has."""
     has: Any = learnt.algorithm.config
-    if type(has) is not type(declared):
-        return has
-    networks = {k: getattr(has, k) for k in ("network", "critic") if hasattr(has, k)}
-    return replace(declared, **networks)
+    return with_networks(declared, has) if type(has) is type(declared) else has
 
 
 def _resume_repair(

@@ -333,7 +333,7 @@ class StageEntry:
     repair: RepairEntry | None = None
     """The stage repairs a skill that has learnt before."""
     extended: NoSetting[AtLeastOne | None] = None
-    """The steps that it was allowed beyond its budget, as its skill acts seldom."""
+    """The budget that it had in place of its own, as its skill acts seldom."""
     continued: NoSetting[list[Count]] = field(default_factory=list)
     """Steps after which the stage had ended, before its budget was raised."""
     careful: NoSetting[bool] = False

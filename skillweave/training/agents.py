@@ -20,7 +20,7 @@ from skillweave.algorithms.actor_critic import ActorCriticAlgorithm
 from skillweave.algorithms.agent_policy import AgentPolicy, make_algorithm, state_from
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.batches import Reference
-from skillweave.algorithms.config import PPO, SAC, config_from_json
+from skillweave.algorithms.config import config_from_json, with_networks
 from skillweave.algorithms.schedules import start_rate
 from skillweave.buffers.recorded_steps import RecordedSteps
 from skillweave.envs.checked import longest_evaluation
@@ -147,16 +147,13 @@ class Agents:
 
     def _config(self, name: str) -> Any:
         """Return a learner's settings, with the networks that it has grown in a population."""
-        config: Any = config_from_json(self.entry.algorithms.get(name, self.entry.algorithm))
-        learns_on = self.entry.careful or self._given(name) is not None
-        if isinstance(config, PPO | SAC) and learns_on:
+        config = config_from_json(self.entry.algorithms.get(name, self.entry.algorithm))
+        if self.entry.careful or self._given(name) is not None:
             config = config.learning_on(continuous=is_continuous(self.roles[name].spaces[1]))
         earlier = self.stage.policies.get(name)
         if not isinstance(earlier, AgentPolicy):
             return config
-        settings: Any = earlier.algorithm.config
-        grown = {k: getattr(settings, k) for k in ("network", "critic") if hasattr(settings, k)}
-        return replace(config, **grown)
+        return with_networks(config, earlier.algorithm.config)
 
     def _given(self, name: str) -> Start | None:
         """Return the policy that a learner was given for this stage or an earlier one, or None."""
@@ -481,8 +478,12 @@ class Agents:
 
     def _compare_with_given(self) -> None:
         """Compare what was learnt with the policy that was given, and keep that if it is better."""
-        log, given = self.log, self.log.at.given
-        if given is None or (now := self._score(given)) is None:
+        log, given, best = self.log, self.log.at.given, self.best.found
+        if given is None:
+            return
+        is_given = best is not None and best.steps == 0  # its weights have been scored
+        now = given if is_given else self._score(given)
+        if now is None:
             return
         # A stage that was continued has no copy of what it was given any more.
         keeps = log.run.manifest.keep != "last" and not self.entry.continued

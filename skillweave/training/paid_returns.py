@@ -25,12 +25,12 @@ class PaidReturns:
         self.episodes = 0
         self._open: list[list[tuple[float, int]]] = [[] for _ in range(num_envs)]
 
-    def see(self, batch: Batch, gamma: Array) -> None:
+    def see(self, batch: Batch, gamma: float) -> None:
         """Go on with rows (T, N).
 
         Args:
             batch: of the learner.
-            gamma: (N,) the discount of one step.
+            gamma: the discount of one step.
         """
         own = batch.own_rows
         reward, steps = batch["reward"], batch["steps"]
@@ -39,7 +39,7 @@ class PaidReturns:
             rows = self._open[column]
             rows.append((float(reward[t, column]), int(steps[t, column])))
             if ended[t, column]:
-                self._close(column, float(gamma[column]), cut=not terminated[t, column])
+                self._close(column, gamma, cut=not terminated[t, column])
 
     def _close(self, column: int, gamma: float, *, cut: bool) -> None:
         """Count the returns of an episode that is over."""

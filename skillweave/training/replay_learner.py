@@ -115,8 +115,10 @@ class ReplayLearner:
         self._learns_from = self._random_until + (0 if len(store) else goes_on_at)
         self._transitions = np.zeros(2)  # of a member: at the latest update, and now
         self._returns: Array | None = None  # (N,), the open episodes' discounted returns
-        self.paid = PaidReturns(store.num_envs)
-        """What its episodes have paid; a learner that goes on counts again."""
+        alone = len(stacks) == 1 and self.members == 1
+        judged = alone and isinstance(stacks[0].algorithm, ActorCriticAlgorithm)
+        self.paid = PaidReturns(store.num_envs) if judged else None
+        """What its episodes have paid; a learner that goes on counts again. None: of no use."""
         self._acting: tuple[ActingParams, ...] = ()  # of the latest request
         self._resumed: tuple[ActingParams, ...] = ()  # of the first request after a checkpoint
         self.keeps_scaling = False
@@ -163,7 +165,8 @@ class ReplayLearner:
         batch = batches[""]
         self.store.add(batch)
         self._transitions[1] += int(batch.own_rows.sum()) / self.members
-        self.paid.see(batch, self._gamma().repeat(self.store.num_envs // self.members))
+        if self.paid is not None:
+            self.paid.see(batch, float(self._gamma()[0]))
         self._see(batch)
         if any(s.algorithm.scales_rewards for s in self.stacks):
             self._scale_returns(batch)
@@ -293,7 +296,8 @@ class ReplayLearner:
     def cut(self, columns: Array) -> None:
         """End the open trajectories of ``columns`` (k,)."""
         self.store.cut(columns)
-        self.paid.cut(columns)
+        if self.paid is not None:
+            self.paid.cut(columns)
         if self._returns is not None:
             self._returns[columns] = 0.0
 
@@ -336,12 +340,10 @@ class ReplayLearner:
         Args:
             metrics: the latest of its update.
         """
-        if len(self.stacks) != 1 or self.members != 1 or self.paid.episodes < ENOUGH:
+        if self.paid is None or self.paid.episodes < ENOUGH:
             return ""
         (stack,) = self.stacks
         algorithm, state = stack.algorithm, stack.state
-        if not isinstance(algorithm, ActorCriticAlgorithm):
-            return ""
         largest = max(self.paid.largest, float(state.end_pay[0]))
         if not largest:
             return ""

@@ -131,7 +131,7 @@ def _lines(run: sw.Run) -> list[dict[str, Any]]:
 
 
 class Single(Side):
-    """Only eight of it may exist at once."""
+    """Only five of it may exist at once."""
 
     open = 0
 

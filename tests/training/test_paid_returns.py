@@ -13,7 +13,7 @@ import skillweave as sw
 from skillweave.algorithms.batches import Batch
 from skillweave.training.paid_returns import PaidReturns
 
-GAMMA = np.array([0.5, 0.5])
+GAMMA = 0.5
 
 
 def rows(reward: Any, terminated: Any, truncated: Any, steps: Any = None, **more: Any) -> Batch:
@@ -40,7 +40,7 @@ def test_a_call_of_three_steps_and_rows_of_others() -> None:
     paid = PaidReturns(1)
     own = np.array([[True], [False], [True]])
     batch = rows([[1], [50], [8]], [[0], [0], [1]], [[0], [0], [0]], [[3], [1], [1]], own=own)
-    paid.see(batch, GAMMA[:1])
+    paid.see(batch, GAMMA)
     assert paid.largest == pytest.approx(max(8.0, 1 + 0.5**3 * 8))
 
 
