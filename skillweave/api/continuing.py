@@ -145,12 +145,15 @@ def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
         elif wanted > budget and entry.done and not finished:
             sentences.append(f"{name} can be given more steps once the run is finished")
         elif wanted > budget:
-            sentences.append(f"{name} continues: {budget:,} -> {wanted:,} steps")
+            had = entry.extended or budget
+            sentences.append(f"{name} continues: {had:,} -> {had + wanted - budget:,} steps")
             grown.append(entry)
     for entry in grown:
         _check_grows(run, entry, more[entry.name])
     for entry in grown:
-        entry.budget = (entry.extended or entry.budget) + more[entry.name]
+        if entry.extended is not None:  # the new steps come after those that it had
+            entry.budget, entry.extended = entry.extended, None
+        entry.budget += more[entry.name]
         if entry.done:
             entry.careful = _became_better(run, entry)
             entry.continued = [*entry.continued, entry.steps or 0]
@@ -200,7 +203,7 @@ def _check_grows(run: RunDirectory, entry: StageEntry, more: int) -> None:
             f"{name!r} (a copy from the hub does not, nor does a run whose disk was full). {new}"
         )
     tensors = run.final_tensors(name)
-    left = entry.budget + more - (entry.steps or 0)
+    left = (entry.extended or entry.budget) + more - (entry.steps or 0)
     for learner, config in _algorithms(entry).items():
         waits = config.get("learning_starts", 0)
         place = "learner." + (f"{learner}." if entry.together else "") + "store."

@@ -79,6 +79,12 @@ def test_a_skill_that_acts_seldom_gets_more_steps_and_goes_on_to_the_bit(
     weights = [run.policy.skills.policies[0].weights for run in (whole, again)]
     for name, value in weights[0].items():
         np.testing.assert_array_equal(value.numpy(), weights[1][name].numpy())
+    more = rare(1_920).train(tmp_path / "stopped", resume=True, seed=0)
+    had = stage["extended"]
+    assert f"rare continues: {had:,} -> {had + 960:,} steps" in capsys.readouterr().err
+    stage = more.info()["stages"][0]
+    assert had + 960 <= stage["steps"] < had + 960 + 64
+    assert "extended" not in stage
 
 
 def test_an_agent_with_a_small_budget_is_told_which_number_to_change(
