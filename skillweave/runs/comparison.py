@@ -22,9 +22,7 @@ SAMPLING: dict[str, tuple[bool, bool]] = {
 _WORDS = {
     "before": "before learning together",
     "given": "as it was given",
-    "given_samples": "as it was given, sampling",
     "greedy": "greedy",
-    "samples": "sampling",
     "skills_sample": "with skills that sample",
     "selector_samples": "with a selector that samples",
     "both_sample": "with skills and a selector that sample",
@@ -75,14 +73,24 @@ class Comparison:
                 "too few steps to compare greedy and sampling in episodes: unless Selection sets "
                 "it, skills sample, and the selector is greedy"
             )
+        if self.given is not None and self.greedy is not None:
+            return self._learnt_on()
         returns = ", ".join(
             f"{words} {mean:.4g}"
             for name, words in _WORDS.items()
             if (mean := getattr(self, name)) is not None
         )
-        found = f"mean return {returns} ({self.episodes} episodes each)"
-        if self.given is None:
-            return f"{found}; kept: {_WORDS[self.kept]}"
+        return f"mean return {returns} ({self.episodes} episodes each); kept: {_WORDS[self.kept]}"
+
+    def _learnt_on(self) -> str:
+        """Return a sentence on a policy that was given and the one that learnt on from it."""
+        before = f"{self.given:.4g} as it was given"
+        if self.given_samples is not None:
+            before += f" ({self.given_samples:.4g} where it samples)"
+        now = f"{self.greedy:.4g} now"
+        if self.samples is not None:
+            now += f" ({self.samples:.4g} where it samples)"
+        found = f"mean return {before}, {now}; {self.episodes} episodes each"
         if self.given_success is not None and self.success is not None:
             found += f", success {self.given_success:.0%} as it was given, {self.success:.0%} now"
         return found + self._advice()
